@@ -1,0 +1,3 @@
+//! Bytes to types and back: the only crate that knows a file format.
+
+pub mod plan;
