@@ -20,3 +20,30 @@ pub trait Field: Sync {
     /// A box outside which f is negative or has no meaning.
     fn bounds(&self) -> Aabb<Patient>;
 }
+
+/// The point of f = 0 reached from `x` by Newton steps along the gradient, at most `reach_mm` away; `None` where the
+/// steps do not arrive (no wall within reach, or a vanishing gradient).
+pub fn foot(field: &dyn Field, x: P3, reach_mm: f64) -> Option<P3> {
+    const STEPS: usize = 30;
+    const TOLERANCE_MM: f64 = 1e-10;
+    let mut p = x;
+    for _ in 0..STEPS {
+        let (f, g) = field.gradient(p);
+        let slope2 = g.length_squared();
+        if !f.is_finite() || slope2 < 1e-12 {
+            return None;
+        }
+        // half the reach at most per step: the gradient far from the wall says little
+        let step = -f / slope2;
+        let length = step.abs() * slope2.sqrt();
+        let damp = if length > 0.5 * reach_mm { 0.5 * reach_mm / length } else { 1.0 };
+        p += g * (step * damp);
+        if p.distance(x) > reach_mm {
+            return None;
+        }
+        if length < TOLERANCE_MM {
+            return Some(p);
+        }
+    }
+    None
+}

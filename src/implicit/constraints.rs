@@ -1,0 +1,275 @@
+//! Curves to constraints: f = 0 on the wall, f = offset inside, f < 0 past the ends.
+//!
+//! Wall points are spread over each curve by arc length and curvature and shifted from plane to plane, so that the
+//! points of neighbouring planes interleave. Interior points lie along the inward normal at min(1 mm, a quarter of the
+//! width of the lumen along that normal), which for a circle is half the radius: method section 3 found that the shape
+//! collapses beyond twice the radius, and that half the radius is safe. Past every end of the data one exterior point
+//! closes the function, which otherwise may run on or meet a neighbour's dome.
+//!
+//! Giordana et al., section 2.2 (boundary and interior constraints after Turk and O'Brien).
+
+use crate::Settings;
+use imaging::{Contours, Curve, Plane};
+use space::{P3, V3};
+
+/// Values wanted of f, with the error that each may have.
+#[derive(Clone, Debug, Default)]
+pub struct Constraints {
+    /// Where.
+    pub points: Vec<P3>,
+    /// Wanted f, mm.
+    pub values: Vec<f64>,
+    /// Standard error of the wanted value, mm.
+    pub sigma_mm: Vec<f64>,
+    /// The first `wall` constraints lie on the wall (value 0).
+    pub wall: usize,
+    /// For each interior constraint (they follow the wall) the wall point it belongs to and its distance, mm.
+    pub interior: Vec<(usize, f64)>,
+    /// For each wall constraint the curve it was taken from; `None` for a tip.
+    pub curve: Vec<Option<usize>>,
+}
+
+/// Fewest wall points per curve: a cubic radial basis needs about this many to carry an ellipse.
+const LEAST_PER_CURVE: f64 = 10.0;
+/// Golden ratio: shifts the first point from plane to plane so that neighbours interleave.
+const GOLDEN: f64 = 0.618_033_988_749_895;
+/// Relative error granted to interior values in the first pass, whose normals are only planar: at 45 degrees between
+/// vessel and slice the true distance is .7 of the offset.
+const PLANAR_NORMAL_ERROR: f64 = 0.2;
+/// Relative error granted to interior values once the normals are three-dimensional: what is left is the difference
+/// between f and a distance near the medial surface.
+const SPATIAL_NORMAL_ERROR: f64 = 0.05;
+
+/// A wall point before the interior points are known.
+struct WallPoint {
+    position: P3,
+    inward: V3,
+    width_mm: f64,
+    sigma_mm: f64,
+    curve: usize,
+}
+
+/// First pass: normals are those of the planar curves.
+pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
+    let wall = wall_points(contours, settings);
+    let mut c = Constraints { wall: wall.len(), ..Constraints::default() };
+    for w in &wall {
+        c.points.push(w.position);
+        c.values.push(0.0);
+        c.sigma_mm.push(w.sigma_mm);
+        c.curve.push(Some(w.curve));
+    }
+    push_tips(contours, &mut c);
+    for (i, w) in wall.iter().enumerate() {
+        let offset = offset(w.width_mm, settings);
+        c.interior.push((i, offset));
+        c.points.push(w.position + w.inward * offset);
+        c.values.push(offset);
+        c.sigma_mm.push(w.sigma_mm.max(PLANAR_NORMAL_ERROR * offset));
+    }
+    push_closing(contours, &mut c);
+    c
+}
+
+/// Second pass: the same wall, interior points along the three-dimensional normals of the first function.
+///
+/// `normal(x)` gives the unit inward normal at a wall point, `inside(x)` whether a point is in the lumen.
+pub(crate) fn spatial(
+    first: &Constraints,
+    normal: impl Fn(P3) -> Option<V3>,
+    inside: impl Fn(P3) -> bool,
+) -> Constraints {
+    let mut c = Constraints {
+        points: first.points[..first.wall].to_vec(),
+        values: first.values[..first.wall].to_vec(),
+        sigma_mm: first.sigma_mm[..first.wall].to_vec(),
+        wall: first.wall,
+        interior: Vec::new(),
+        curve: first.curve.clone(),
+    };
+    for (k, &(i, planar_offset)) in first.interior.iter().enumerate() {
+        let x = first.points[i];
+        let Some(n) = normal(x) else { continue };
+        // the inside check: twice the offset must still be lumen, else the offset passes the medial surface
+        let mut offset = planar_offset;
+        while offset > 0.1 * planar_offset && !inside(x + n * (2.0 * offset)) {
+            offset *= 0.5;
+        }
+        if offset <= 0.1 * planar_offset {
+            continue;
+        }
+        c.interior.push((i, offset));
+        c.points.push(x + n * offset);
+        c.values.push(offset);
+        let planar_sigma = first.sigma_mm[first.wall + k];
+        c.sigma_mm.push((SPATIAL_NORMAL_ERROR * offset).min(planar_sigma));
+    }
+    let closing = first.wall + first.interior.len();
+    c.points.extend_from_slice(&first.points[closing..]);
+    c.values.extend_from_slice(&first.values[closing..]);
+    c.sigma_mm.extend_from_slice(&first.sigma_mm[closing..]);
+    c
+}
+
+fn offset(width_mm: f64, settings: &Settings) -> f64 {
+    settings.offset_mm.min(0.25 * width_mm)
+}
+
+/// Wall points of all curves; the step between them grows until all constraints fit under the limit.
+fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
+    let spacing = plane_spacing_mm(contours);
+    let mut step = contours.pixel_mm.max(0.5 * spacing);
+    loop {
+        let count: usize = contours.curves.iter().map(|c| count_on(c, step)).sum();
+        // one interior point per wall point, and room for tips and closing points
+        if 2 * count + 64 <= settings.max_constraints || step > 1e3 * spacing.max(contours.pixel_mm) {
+            break;
+        }
+        step *= 1.05;
+    }
+    contours.curves.iter().enumerate().flat_map(|(i, c)| points_on(contours, i, c, step)).collect()
+}
+
+fn plane_spacing_mm(contours: &Contours) -> f64 {
+    let mut d: Vec<f64> =
+        contours.planes.windows(2).map(|p| (p[1].origin - p[0].origin).dot(p[0].normal()).abs()).collect();
+    d.sort_by(f64::total_cmp);
+    d.get(d.len() / 2).copied().unwrap_or(contours.pixel_mm)
+}
+
+fn count_on(curve: &Curve, step: f64) -> usize {
+    (curve.length_mm() / step).ceil().max(LEAST_PER_CURVE) as usize
+}
+
+/// Points of one curve, denser where it bends: density = (1 + |kappa| R) / 2 with R = length / 2 pi, so that a circle
+/// is sampled evenly.
+fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Vec<WallPoint> {
+    let plane = &contours.planes[curve.plane];
+    let length = curve.length_mm();
+    let fine = 4 * count_on(curve, step).max(32);
+    let radius = length / std::f64::consts::TAU;
+    let mut cumulative = vec![0.0];
+    for k in 0..fine {
+        let p = curve.at(plane, (k as f64 + 0.5) * length / fine as f64);
+        let density = 0.5 * (1.0 + (p.curvature_per_mm.abs() * radius).min(4.0));
+        cumulative.push(cumulative[k] + density);
+    }
+    let total = cumulative[fine];
+    let count = count_on(curve, step);
+    let phase = (GOLDEN * curve.plane as f64).fract();
+    let polygons = polygons(contours, curve.plane);
+    let mut out = Vec::with_capacity(count);
+    let mut k = 0;
+    for i in 0..count {
+        let want = (i as f64 + phase) / count as f64 * total;
+        while cumulative[k + 1] < want {
+            k += 1;
+        }
+        let s = (k as f64 + (want - cumulative[k]) / (cumulative[k + 1] - cumulative[k])) * length / fine as f64;
+        let p = curve.at(plane, s);
+        if p.on_border {
+            continue;
+        }
+        out.push(WallPoint {
+            position: p.position,
+            inward: p.inward,
+            width_mm: width(plane, &polygons, p.position, p.inward).unwrap_or(2.0 * radius),
+            sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
+            curve: number,
+        });
+    }
+    out
+}
+
+/// Floor of the standard error in pixels. Without noise the contours of a discretised disc still err by about this much
+/// (linear interpolation in marching squares), and a smaller one makes the system needlessly stiff.
+const LEAST_SIGMA_PX: f64 = 0.005;
+
+/// All curves of a plane as polygons in its (u, v).
+fn polygons(contours: &Contours, plane: usize) -> Vec<Vec<[f64; 2]>> {
+    const SIDES: usize = 96;
+    let of_plane = contours.curves.iter().filter(|c| c.plane == plane);
+    of_plane
+        .map(|c| (0..SIDES).map(|k| c.spline.derivatives(k as f64 * c.length_mm() / SIDES as f64)[0]).collect())
+        .collect()
+}
+
+/// Distance from a wall point along its inward normal to the other side of the lumen, mm.
+fn width(plane: &Plane, polygons: &[Vec<[f64; 2]>], from: P3, inward: V3) -> Option<f64> {
+    let o = plane.in_plane(from);
+    let d = [inward.dot(plane.u), inward.dot(plane.v)];
+    let mut best = f64::INFINITY;
+    for polygon in polygons {
+        for (k, a) in polygon.iter().enumerate() {
+            let b = polygon[(k + 1) % polygon.len()];
+            if let Some(t) = crossing(o, d, *a, b) {
+                // the chord polygon passes within its sagitta of the start: skip it
+                if t > 1e-2 * (b[0] - a[0]).hypot(b[1] - a[1]) + 1e-2 && t < best {
+                    best = t;
+                }
+            }
+        }
+    }
+    best.is_finite().then_some(best)
+}
+
+/// Ray parameter at which o + t d crosses the segment a-b.
+fn crossing(o: [f64; 2], d: [f64; 2], a: [f64; 2], b: [f64; 2]) -> Option<f64> {
+    let e = [b[0] - a[0], b[1] - a[1]];
+    let w = [a[0] - o[0], a[1] - o[1]];
+    let det = d[0] * e[1] - d[1] * e[0];
+    if det.abs() < 1e-14 {
+        return None;
+    }
+    let t = (w[0] * e[1] - w[1] * e[0]) / det;
+    let q = (w[0] * d[1] - w[1] * d[0]) / det;
+    (t > 0.0 && (0.0..1.0).contains(&q)).then_some(t)
+}
+
+/// Where a lumen ends inside the volume the wall closes at the tip.
+fn push_tips(contours: &Contours, c: &mut Constraints) {
+    for tip in &contours.tips {
+        c.points.push(tip.position);
+        c.values.push(0.0);
+        c.sigma_mm.push(0.5 * contours.pixel_mm);
+        c.curve.push(None);
+        c.wall += 1;
+    }
+}
+
+/// Exterior points past the ends. Their error is granted as their distance to the wall: they tell where outside is, not
+/// where the wall is.
+fn push_closing(contours: &Contours, c: &mut Constraints) {
+    let mut push = |position: P3, depth: f64| {
+        c.points.push(position);
+        c.values.push(-depth);
+        c.sigma_mm.push(0.5 * depth);
+    };
+    for tip in &contours.tips {
+        push(tip.position + tip.outward * contours.pixel_mm, contours.pixel_mm);
+    }
+    for curve in contours.curves.iter().filter(|c| !c.hole) {
+        let plane = &contours.planes[curve.plane];
+        let radius = curve.length_mm() / std::f64::consts::TAU;
+        let samples: Vec<P3> = (0..64).map(|k| curve.at(plane, k as f64 / 64.0 * curve.length_mm()).position).collect();
+        let Some(centre) = P3::centroid(&samples) else { continue };
+        for cut in &contours.cuts {
+            let parallel = cut.outward.dot(plane.normal()).abs() > 0.999;
+            let touching = if parallel {
+                ((centre - cut.point).dot(cut.outward).abs() < 1e-3 * contours.pixel_mm).then_some(centre)
+            } else {
+                border_middle(curve, plane).filter(|m| (*m - cut.point).dot(cut.outward) > -contours.pixel_mm)
+            };
+            if let Some(at) = touching {
+                push(at + cut.outward * (2.0 * radius), radius);
+            }
+        }
+    }
+}
+
+/// Middle of a curve's parcel along the image border.
+fn border_middle(curve: &Curve, plane: &Plane) -> Option<P3> {
+    let &[a, b] = curve.border.first()?;
+    let length = curve.length_mm();
+    Some(curve.at(plane, a + 0.5 * (b - a).rem_euclid(length)).position)
+}
