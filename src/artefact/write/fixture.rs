@@ -16,6 +16,7 @@ use surface::TriMesh;
 /// Owns what a [`Reconstruction`] borrows.
 pub(crate) struct Fixture {
     pub mesh: TriMesh,
+    pub area_and_volume: [f64; 2],
     pub graph: MedialGraph,
     pub morphometry: Morphometry,
     pub contours: Contours,
@@ -205,6 +206,7 @@ impl Fixture {
             displacement: mesh.vertices.iter().map(|p| 0.1 * (p.z() * 0.7).sin()).collect(),
             patch_id: mesh.triangles.iter().map(|t| t[0] % 12).collect(),
             uv: mesh.vertices.iter().map(|p| p.x() / 100.0).collect(),
+            area_and_volume: [mesh.area(), mesh.volume()],
             mesh,
             graph: MedialGraph { nodes, edges },
             morphometry: Morphometry {
@@ -275,8 +277,8 @@ impl Fixture {
                     euler: 2,
                     components: 1,
                     max_error_mm: 0.018,
-                    area_mm2: self.mesh.area(),
-                    volume_mm3: self.mesh.volume(),
+                    area_mm2: self.area_and_volume[0],
+                    volume_mm3: self.area_and_volume[1],
                     displacement_px: range(2.0),
                     displacement_mm: range(1.0),
                     caps: (0..3).map(cap).collect(),

@@ -12,8 +12,8 @@ use crate::Reconstruction;
 use crate::reconstruction::SlicePicture;
 use askama::Template;
 use image::ExtendedColorType;
-use morphometry::{Angle, Junction, Role};
-use space::{P3, V3};
+use morphometry::{Angle, Branch, Junction, Role};
+use space::V3;
 use std::fmt::Write as _;
 
 /// Warnings printed.
@@ -233,12 +233,8 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
     let mut svg = format!(
         "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"surface with medial lines\"><image width=\"{width}\" height=\"{height}\" href=\"data:image/png;base64,{png}\"/>"
     );
-    for b in &r.morphometry.branches {
-        let Some(p) = label_point(r, b.id, b.to_node).filter(|_| b.role != Role::Other) else { continue };
-        let [x, y, _] = camera.project(p);
-        let x = x.clamp(60.0, width as f64 - 60.0);
-        let y = (y + 8.0).clamp(30.0, height as f64 - 14.0);
-        label(&mut svg, [x, y], "middle", &hex(role_rgb(b.role)), role_words(b.role));
+    for b in r.morphometry.branches.iter().filter(|b| b.role != Role::Other) {
+        branch_label(&mut svg, r, camera, b);
     }
     scale_bar(&mut svg, camera);
     directions(&mut svg, camera);
@@ -246,13 +242,25 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
     Ok(svg)
 }
 
-/// The point two thirds along a branch.
-fn label_point(r: &Reconstruction<'_>, edge: usize, to: usize) -> Option<P3> {
-    let e = r.graph.edges.get(edge)?;
+/// A branch's name beside the vessel, two thirds along the branch, on the side to which it leans.
+fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &Branch) {
+    let Some(e) = r.graph.edges.get(b.id) else { return };
     let n = e.points.len();
-    let k = n * 2 / 3;
-    let k = if e.nodes[1] == to { k } else { n.saturating_sub(1 + k) };
-    e.points.get(k).copied().filter(|p| p.is_finite())
+    let k = if e.nodes[1] == b.to_node { n * 2 / 3 } else { n.saturating_sub(1 + n * 2 / 3) };
+    let (Some(&p), Some(&first), Some(radius)) = (e.points.get(k), e.points.first(), e.radius_mm.get(k)) else {
+        return;
+    };
+    let start = if e.nodes[1] == b.to_node { first } else { e.points.last().copied().unwrap_or(first) };
+    if !(p.is_finite() && start.is_finite() && radius.is_finite()) {
+        return;
+    }
+    let ([x, y, _], [x_start, ..]) = (camera.project(p), camera.project(start));
+    let beside = 1.2 * radius / camera.mm_per_px + 10.0;
+    let width = camera.size[0] as f64;
+    let y = (y + 8.0).clamp(30.0, camera.size[1] as f64 - 14.0);
+    let (x, anchor) =
+        if x > x_start + 1.0 { ((x + beside).min(width - 110.0), "start") } else { ((x - beside).max(110.0), "end") };
+    label(svg, [x, y], anchor, &hex(role_rgb(b.role)), role_words(b.role));
 }
 
 fn label(svg: &mut String, at: [f64; 2], anchor: &str, colour: &str, words: &str) {

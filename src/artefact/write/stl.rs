@@ -6,8 +6,9 @@ use surface::TriMesh;
 /// surface.stl: an 80 byte header, the count, then 50 bytes per triangle (little endian).
 ///
 /// # Errors
-/// [`Error::TooLarge`] beyond 2^32 - 1 triangles; [`Error::NotFinite`].
+/// [`Error::TooLarge`] beyond 2^32 - 1 triangles; [`Error::Mismatch`], [`Error::NotFinite`].
 pub fn surface_stl(mesh: &TriMesh) -> Result<Vec<u8>, Error> {
+    super::geometry::checked_mesh(SURFACE_STL, mesh)?;
     let n = mesh.triangles.len();
     let count = u32::try_from(n).map_err(|_| Error::TooLarge {
         artefact: SURFACE_STL,
