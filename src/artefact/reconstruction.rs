@@ -7,7 +7,7 @@
 //! the byte from run to run.
 
 use imaging::Contours;
-use morphometry::{Morphometry, Role};
+use morphometry::{Junction, Morphometry, Role};
 use skeleton::MedialGraph;
 use space::{P3, V3, Warning};
 use surface::TriMesh;
@@ -45,6 +45,19 @@ impl Reconstruction<'_> {
             }
         }
         all
+    }
+    /// The junction that the pictures face and the report puts first: a measured one before others, then the one whose
+    /// thinnest branch is widest (an aortic bifurcation before the origin of a renal artery), then by node.
+    pub fn main_junction(&self) -> Option<&Junction> {
+        let width = |id: &usize| {
+            let branch = self.morphometry.branches.iter().find(|b| b.id == *id);
+            branch.and_then(|b| b.diameter_mm).unwrap_or(0.0)
+        };
+        let thinnest = |j: &Junction| j.branches.iter().map(width).fold(f64::INFINITY, f64::min);
+        let measured = |j: &Junction| j.angles.iter().any(|a| a.value_deg.is_some());
+        self.morphometry.junctions.iter().min_by(|a, b| {
+            measured(b).cmp(&measured(a)).then(thinnest(b).total_cmp(&thinnest(a))).then(a.node.cmp(&b.node))
+        })
     }
     /// The role of the branch that was measured on a graph edge, where there is one.
     pub fn role_of_edge(&self, edge: usize) -> Option<Role> {

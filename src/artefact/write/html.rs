@@ -1,9 +1,10 @@
 //! report.html: one self-contained A4 page without script.
 //!
 //! Pictures are PNG in base64, plots and overlays SVG, the styles inline; nothing is fetched. Warnings come first, since
-//! the reader who stops after the first lines must have seen them. The page has room for what a surgeon compares; what
-//! does not fit (more than [`WARNINGS`] warnings, more than [`JUNCTIONS`] junctions) is counted and found in
-//! result.json. No time and no host is printed, so that the page is the same to the byte from run to run.
+//! the reader who stops after the first lines must have seen them. A vessel with one junction fits one page; further
+//! junctions follow on pages of their own. What does not fit (more than [`WARNINGS`] warnings, [`BRANCHES`] branches,
+//! [`FURTHER`] further junctions) is counted and found in result.json. No time and no host is printed, so that the page
+//! is the same to the byte from run to run.
 
 use super::render::{Camera, cameras, encode_png, picture};
 use super::style::{ANGLE_RGB, angle_words, hex, role_rgb, role_words};
@@ -18,10 +19,12 @@ use std::fmt::Write as _;
 
 /// Warnings printed.
 const WARNINGS: usize = 5;
-/// Junctions whose angles are printed.
-const JUNCTIONS: usize = 2;
+/// Branches printed.
+const BRANCHES: usize = 6;
+/// Junctions printed after the main one.
+const FURTHER: usize = 16;
 /// Pixels of a picture of the surface: 91 mm wide at 230 dpi.
-const PICTURE: [usize; 2] = [824, 600];
+const PICTURE: [usize; 2] = [824, 520];
 /// Smallest side of the part of a slice that is shown, pixels.
 const CROP: f64 = 32.0;
 /// Side of that part over the extent of the contours.
@@ -35,10 +38,10 @@ struct Page {
     more_warnings: usize,
     views: Vec<View>,
     legend: Vec<Swatch>,
-    junctions: Vec<AngleTable>,
+    junction: Option<AngleTable>,
+    further: Vec<AngleTable>,
     more_junctions: usize,
     angle_plot: Option<String>,
-    angle_plot_title: String,
     radius_plot: Option<String>,
     slices: Vec<SliceView>,
     branches: Vec<[String; 6]>,
@@ -61,6 +64,7 @@ struct AngleTable {
 struct AngleRow {
     colour: String,
     words: String,
+    measured: bool,
     value: String,
     band: String,
     window: String,
@@ -77,8 +81,9 @@ struct SliceView {
 pub fn report_html(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
     super::geometry::checked_mesh(REPORT_HTML, r.surface.mesh)?;
     let warnings = r.all_warnings();
-    let shown = shown_junctions(r);
-    let first = shown.iter().find(|j| j.angles.iter().any(|a| a.by_distance.is_some()));
+    let main = r.main_junction();
+    let others: Vec<&Junction> =
+        r.morphometry.junctions.iter().filter(|j| main.is_none_or(|m| !std::ptr::eq(*j, m))).collect();
     let page = Page {
         digest: r.input.digest.clone(),
         more_warnings: warnings.len().saturating_sub(WARNINGS),
@@ -89,13 +94,10 @@ pub fn report_html(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
             .collect(),
         views: views(r)?,
         legend: legend(r),
-        junctions: shown.iter().map(|j| angle_table(j)).collect(),
-        more_junctions: r.morphometry.junctions.len() - shown.len(),
-        angle_plot: first.map_or(Ok(None), |j| plot::angles_by_distance(j))?,
-        angle_plot_title: match first {
-            Some(j) if shown.len() > 1 => format!("Angle against fitting distance, junction {}", j.node),
-            _ => "Angle against fitting distance".to_owned(),
-        },
+        junction: main.map(angle_table),
+        further: others.iter().take(FURTHER).map(|j| angle_table(j)).collect(),
+        more_junctions: others.len().saturating_sub(FURTHER),
+        angle_plot: main.map_or(Ok(None), plot::angles_by_distance)?,
         radius_plot: plot::radius_along_branches(&r.morphometry.branches)?,
         slices: r.pictures.iter().take(3).map(slice_view).collect::<Result<_, _>>()?,
         branches: branch_rows(r),
@@ -104,21 +106,6 @@ pub fn report_html(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
     };
     let text = page.render().map_err(|e| Error::Encode { artefact: REPORT_HTML, reason: e.to_string() })?;
     Ok(text.into_bytes())
-}
-
-/// Branches printed.
-const BRANCHES: usize = 6;
-
-/// The junctions worth the page: those of the widest branches first, measured ones before others, then by node.
-fn shown_junctions<'a>(r: &Reconstruction<'a>) -> Vec<&'a Junction> {
-    let radius = |j: &Junction| r.graph.nodes.get(j.node).map_or(0.0, |n| n.radius_mm);
-    let mut all: Vec<&Junction> = r.morphometry.junctions.iter().collect();
-    all.sort_by(|a, b| {
-        let measured = |j: &Junction| j.angles.iter().any(|x| x.value_deg.is_some());
-        measured(b).cmp(&measured(a)).then(radius(b).total_cmp(&radius(a))).then(a.node.cmp(&b.node))
-    });
-    all.truncate(JUNCTIONS);
-    all
 }
 
 /// A number or a dash.
@@ -130,7 +117,8 @@ fn angle_table(j: &Junction) -> AngleTable {
     let row = |(i, a): (usize, &Angle)| AngleRow {
         colour: hex(ANGLE_RGB[i % ANGLE_RGB.len()]),
         words: angle_words(&a.name),
-        value: if a.value_deg.is_none() { "not measured".to_owned() } else { text(a.value_deg, 1) },
+        measured: a.value_deg.is_some(),
+        value: text(a.value_deg, 1),
         band: a.band95_deg.map_or(text(None, 1), |b| format!("{:.1} \u{2013} {:.1}", b[0], b[1])),
         window: a.window_diameters.map_or(text(None, 1), |w| format!("{:.1} \u{2013} {:.1}", w[0], w[1])),
     };
@@ -153,7 +141,7 @@ fn branch_rows(r: &Reconstruction<'_>) -> Vec<[String; 6]> {
                 text(Some(b.length_mm), 1),
                 text(b.diameter_mm, 2),
                 text(Some(b.tortuosity), 3),
-                b.helix.map_or(text(None, 1), |h| format!("{:.3} / {:.3}", h.curvature_per_mm, h.torsion_per_mm)),
+                text(b.helix.map(|h| h.torsion_per_mm), 3),
             ]
         })
         .collect()
@@ -213,7 +201,7 @@ fn legend(r: &Reconstruction<'_>) -> Vec<Swatch> {
 }
 
 fn views(r: &Reconstruction<'_>) -> Result<Vec<View>, Error> {
-    let plane = r.morphometry.junctions.iter().any(|j| j.plane_normal.is_some());
+    let plane = r.main_junction().is_some_and(|j| j.plane_normal.is_some());
     let titles = if plane {
         ["Onto the plane of graft and proximal vessel", "Along that plane"]
     } else {
@@ -254,12 +242,22 @@ fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &B
     if !(p.is_finite() && start.is_finite() && radius.is_finite()) {
         return;
     }
-    let ([x, y, _], [x_start, ..]) = (camera.project(p), camera.project(start));
-    let beside = 1.2 * radius / camera.mm_per_px + 10.0;
-    let width = camera.size[0] as f64;
-    let y = (y + 8.0).clamp(30.0, camera.size[1] as f64 - 14.0);
-    let (x, anchor) =
-        if x > x_start + 1.0 { ((x + beside).min(width - 110.0), "start") } else { ((x - beside).max(110.0), "end") };
+    let ([x, y, _], [x0, y0, _]) = (camera.project(p), camera.project(start));
+    let length = (x - x0).hypot(y - y0).max(1e-9);
+    let (dx, dy) = ((x - x0) / length, (y - y0) / length);
+    // To the right of a branch that leans right, to the left of any other, under a level one.
+    let side = if dx > 0.02 { 1.0 } else { -1.0 };
+    let (nx, ny) = if dy.abs() > 0.3 { (side * dy.abs(), side * -dx * dy.signum()) } else { (0.0, 1.0) };
+    let off = 1.15 * radius / camera.mm_per_px + 14.0;
+    let [width, height] = camera.size.map(|n| n as f64);
+    let y = (y + ny * (off + 8.0) + 8.0).clamp(30.0, height - 60.0);
+    let (x, anchor) = if nx == 0.0 {
+        (x.clamp(60.0, width - 60.0), "middle")
+    } else if nx > 0.0 {
+        ((x + nx * off).min(width - 110.0), "start")
+    } else {
+        ((x + nx * off).max(110.0), "end")
+    };
     label(svg, [x, y], anchor, &hex(role_rgb(b.role)), role_words(b.role));
 }
 

@@ -5,9 +5,9 @@ use super::{Error, REPORT_HTML};
 use morphometry::{Branch, Junction, Section};
 use plotters::prelude::*;
 
-/// Drawn size, user units; the page scales it.
-const SIZE: (u32, u32) = (520, 290);
-const TEXT: u32 = 15;
+/// Drawn size, user units; the page scales it. The plots are drawn in whole units, so that they must be many.
+const SIZE: (u32, u32) = (2080, 1080);
+const TEXT: u32 = 58;
 /// Room above and below the curves, parts of their range.
 const MARGIN: f64 = 0.08;
 
@@ -25,8 +25,9 @@ pub(crate) enum Stroke {
     Thin,
 }
 
-/// Angle against the end of the fit window, a curve per angle in the order of the junction's angles; `None` when no
-/// angle knows its dependence on distance.
+/// Change of each angle with the end of the fit window, against its reported value: the angles of a junction lie up to
+/// 120 degrees apart, and on one axis a change of a degree would not be seen. `None` when no angle with a value knows its
+/// dependence on distance.
 ///
 /// # Errors
 /// [`Error::Encode`].
@@ -36,12 +37,12 @@ pub(crate) fn angles_by_distance(j: &Junction) -> Result<Option<String>, Error> 
         .iter()
         .enumerate()
         .filter_map(|(i, a)| {
-            let d = a.by_distance.as_ref()?;
-            let points = d.diameters.iter().zip(&d.value_deg).map(|(&x, y)| y.map(|y| (x, y))).collect();
+            let (d, reported) = (a.by_distance.as_ref()?, a.value_deg?);
+            let points = d.diameters.iter().zip(&d.value_deg).map(|(&x, y)| y.map(|y| (x, y - reported))).collect();
             Some(Curve { points, rgb: ANGLE_RGB[i % ANGLE_RGB.len()], stroke: Stroke::Solid })
         })
         .collect();
-    chart(&curves, "distance from the axes point, graft diameters", "angle, degrees", Floor::Free)
+    chart(&curves, "end of the fit window, graft diameters", "change, degrees", Floor::Free)
 }
 
 /// Area-equivalent (solid) and inscribed radius (thin) along every branch; `None` without sections.
@@ -101,10 +102,10 @@ fn draw(svg: &mut String, curves: &[Curve], (x, y): Ranges, labels: [&str; 2]) -
     let text = |e: &dyn std::fmt::Display| e.to_string();
     let root = SVGBackend::with_string(svg, SIZE).into_drawing_area();
     let mut chart = ChartBuilder::on(&root)
-        .margin(6)
-        .margin_right(14)
-        .x_label_area_size(44)
-        .y_label_area_size(58)
+        .margin(20)
+        .margin_right(56)
+        .x_label_area_size(165)
+        .y_label_area_size(215)
         .build_cartesian_2d(x, y)
         .map_err(|e| text(&e))?;
     chart
@@ -113,9 +114,10 @@ fn draw(svg: &mut String, curves: &[Curve], (x, y): Ranges, labels: [&str; 2]) -
         .y_desc(labels[1])
         .x_labels(7)
         .y_labels(6)
+        .set_all_tick_mark_size(16)
         .max_light_lines(0)
-        .bold_line_style(RGBColor(0xe2, 0xe2, 0xe8))
-        .axis_style(RGBColor(0x55, 0x55, 0x60))
+        .bold_line_style(RGBColor(0xe2, 0xe2, 0xe8).stroke_width(3))
+        .axis_style(RGBColor(0x55, 0x55, 0x60).stroke_width(3))
         .label_style(("sans-serif", TEXT))
         .axis_desc_style(("sans-serif", TEXT))
         .x_label_formatter(&|v| tick(*v))
@@ -125,8 +127,8 @@ fn draw(svg: &mut String, curves: &[Curve], (x, y): Ranges, labels: [&str; 2]) -
     for curve in curves {
         let [r, g, b] = curve.rgb;
         let style = match curve.stroke {
-            Stroke::Solid => RGBColor(r, g, b).stroke_width(2),
-            Stroke::Thin => RGBColor(r, g, b).mix(0.55).stroke_width(1),
+            Stroke::Solid => RGBColor(r, g, b).stroke_width(9),
+            Stroke::Thin => RGBColor(r, g, b).mix(0.55).stroke_width(5),
         };
         for run in runs(&curve.points) {
             chart.draw_series(LineSeries::new(run, style)).map_err(|e| text(&e))?;

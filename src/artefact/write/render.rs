@@ -73,11 +73,11 @@ impl Camera {
     }
 }
 
-/// The two directions of the report: onto the plane of the first measured junction (from the side nearer to anterior)
+/// The two directions of the report: onto the plane of the main junction (from the side nearer to anterior)
 /// and along it; from anterior and from the left where there is no plane. The head is up unless one looks along it.
 pub fn cameras(r: &Reconstruction<'_>, size: [usize; 2]) -> [Camera; 2] {
     let anterior = -V3::Y;
-    let normal = r.morphometry.junctions.iter().find_map(|j| j.plane_normal);
+    let normal = r.main_junction().and_then(|j| j.plane_normal);
     let front = match normal {
         Some(n) if n.dot(anterior) < -1e-9 => -n,
         Some(n) => n,

@@ -332,7 +332,9 @@ fn the_report_is_self_contained_and_escapes_what_others_wrote() {
         assert!(!text.replace("http://www.w3.org/2000/svg", "").contains(foreign), "{foreign}");
     }
     assert!(text.contains("&#38; &#60;more&#62;"), "the warning is not escaped");
-    for shown in ["45.4", "44.8 \u{2013} 46.0", "not measured", "graft to proximal", "watertight", "slice 14"] {
+    for shown in
+        ["45.4", "44.8 \u{2013} 46.0", "not measured, see the warnings", "graft to proximal", "watertight", "slice 14"]
+    {
         assert!(text.contains(shown), "{shown}");
     }
     assert!(text.find("slice 7 is missing") < text.find("graft to proximal"), "warnings come first");
