@@ -139,9 +139,11 @@ fn branch(id: usize) -> (Edge, Branch) {
 fn angles() -> Vec<Angle> {
     let names = ["graft_proximal", "graft_distal_planar", "distal_normal", "proximal_distal", "graft_distal"];
     let values = [45.4, 121.25, 74.9, 163.0, 128.7];
-    let angle = |(name, value): (&&str, f64)| {
+    let angle = |(k, (name, value)): (usize, (&&str, f64))| {
+        let size = 2.0 - k as f64;
         let diameters: Vec<f64> = (0..25).map(|i| 1.6 + 0.1 * f64::from(i)).collect();
-        let value_deg = diameters.iter().map(|d| (*d > 1.75).then(|| value + 2.0 * (-(d - 1.6) * 1.5).exp())).collect();
+        let value_deg =
+            diameters.iter().map(|d| (*d > 1.75).then(|| value + size * (-(d - 1.6) * 1.5).exp())).collect();
         Angle {
             name: (*name).to_owned(),
             value_deg: Some(value),
@@ -150,7 +152,7 @@ fn angles() -> Vec<Angle> {
             by_distance: Some(ByDistance { diameters, value_deg }),
         }
     };
-    let mut all: Vec<Angle> = names.iter().zip(values).map(angle).collect();
+    let mut all: Vec<Angle> = names.iter().zip(values).enumerate().map(angle).collect();
     all[4] = Angle {
         name: "graft_distal".to_owned(),
         value_deg: None,

@@ -22,9 +22,9 @@ const WARNINGS: usize = 5;
 /// Branches printed.
 const BRANCHES: usize = 6;
 /// Junctions printed after the main one.
-const FURTHER: usize = 16;
+const FURTHER: usize = 14;
 /// Pixels of a picture of the surface: 91 mm wide at 230 dpi.
-const PICTURE: [usize; 2] = [824, 520];
+const PICTURE: [usize; 2] = [824, 470];
 /// Smallest side of the part of a slice that is shown, pixels.
 const CROP: f64 = 32.0;
 /// Side of that part over the extent of the contours.
@@ -183,7 +183,7 @@ fn quality(r: &Reconstruction<'_>) -> Vec<[String; 2]> {
         ("Triangle angles", format!("{:.1}\u{b0} to {:.1}\u{b0}", q.min_angle_deg, q.max_angle_deg)),
         ("Mesh error", format!("{:.3} mm", q.max_error_mm)),
         (
-            "Smoothing moved the wall by",
+            "Smoothing",
             format!(
                 "{:+.2} to {:+.2} px, {:.2} rms",
                 q.displacement_px.min, q.displacement_px.max, q.displacement_px.rms

@@ -14,6 +14,7 @@ mod plot;
 mod provenance;
 pub mod render;
 mod result;
+mod slices;
 mod stl;
 mod style;
 mod vtp;
@@ -32,6 +33,7 @@ pub use html::report_html;
 pub use json::DIGITS;
 pub use provenance::{Provenance, StageTime, provenance};
 pub use result::{result_json, skeleton_json};
+pub use slices::slice_pictures;
 pub use stl::surface_stl;
 
 use crate::Reconstruction;

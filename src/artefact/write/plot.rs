@@ -6,7 +6,7 @@ use morphometry::{Branch, Junction, Section};
 use plotters::prelude::*;
 
 /// Drawn size, user units; the page scales it. The plots are drawn in whole units, so that they must be many.
-const SIZE: (u32, u32) = (2080, 1080);
+const SIZE: (u32, u32) = (2080, 990);
 const TEXT: u32 = 58;
 /// Room above and below the curves, parts of their range.
 const MARGIN: f64 = 0.08;
