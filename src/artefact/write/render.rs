@@ -3,7 +3,7 @@
 //! The report and the thumbnails must be the same to the byte on every machine and need no GPU, so a small rasteriser
 //! does it: parallel projection, z-buffer, smooth normals, one key light and a headlight (Lambert), darkened rims,
 //! [`SAMPLES`]^2 samples per pixel. The medial lines lie inside the lumen and are drawn over the surface with a white
-//! rim. A 2 million triangle surface takes about a second; there is no acceleration structure to keep.
+//! rim. Both pictures of a surface of 446,000 triangles take 0.5 s; there is no acceleration structure to keep.
 
 use super::geometry::vertex_normals;
 use super::style::role_rgb;
