@@ -1,3 +1,8 @@
 //! Bytes to types and back: the only crate that knows a file format.
 
 pub mod plan;
+pub mod problem;
+pub mod reconstruction;
+pub mod write;
+
+pub use reconstruction::Reconstruction;

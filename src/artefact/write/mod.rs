@@ -1,0 +1,127 @@
+//! Types to result files. [`write_all`] makes every artefact of contract.md but provenance.json, byte for byte the same
+//! from run to run and for any number of threads (nothing here runs in parallel, reads a clock or iterates a hash map);
+//! [`provenance`] makes the one file that differs.
+//!
+//! Everything is made in memory before a byte is written, so that a fault in the last artefact leaves nothing behind.
+
+mod csv;
+mod error;
+mod geometry;
+mod glb;
+mod html;
+mod json;
+mod plot;
+mod provenance;
+pub mod render;
+mod result;
+mod slices;
+mod stl;
+mod style;
+mod vtp;
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod fixture;
+#[cfg(test)]
+mod tests;
+
+pub use self::csv::angles_csv;
+pub use error::Error;
+pub use geometry::{skeleton_vtp, surface_vtp};
+pub use glb::{gltf_position, surface_glb};
+pub use html::report_html;
+pub use json::DIGITS;
+pub use provenance::{Provenance, StageTime, provenance};
+pub use result::{result_json, skeleton_json};
+pub use slices::slice_pictures;
+pub use stl::surface_stl;
+
+use crate::Reconstruction;
+use sha2::{Digest, Sha256};
+use std::fmt::Write as _;
+
+/// The numbers.
+pub const RESULT_JSON: &str = "result.json";
+/// The angles as a table.
+pub const ANGLES_CSV: &str = "angles.csv";
+/// The medial graph.
+pub const SKELETON_JSON: &str = "skeleton.json";
+/// The medial lines for VTK.
+pub const SKELETON_VTP: &str = "skeleton.vtp";
+/// The surface for VTK.
+pub const SURFACE_VTP: &str = "surface.vtp";
+/// The surface and the medial lines for viewers.
+pub const SURFACE_GLB: &str = "surface.glb";
+/// The surface for everything else.
+pub const SURFACE_STL: &str = "surface.stl";
+/// The contours for VTK.
+pub const CONTOURS_VTP: &str = "contours.vtp";
+/// The page to read and print.
+pub const REPORT_HTML: &str = "report.html";
+/// Thumbnail.
+pub const PREVIEW_PNG: &str = "preview.png";
+/// Times, host and version.
+pub const PROVENANCE_JSON: &str = "provenance.json";
+
+/// Size of preview.png, pixels.
+pub const PREVIEW_SIZE: [usize; 2] = [480, 360];
+
+/// A file in memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NamedBytes {
+    /// Its name in the folder and in the API.
+    pub name: &'static str,
+    /// Its content.
+    pub bytes: Vec<u8>,
+}
+
+impl NamedBytes {
+    /// `sha256:` and the hexadecimal digest of the content.
+    pub fn digest(&self) -> String {
+        let mut out = String::from("sha256:");
+        for byte in Sha256::digest(&self.bytes) {
+            // Writing into a String cannot fail.
+            let _ = write!(out, "{byte:02x}");
+        }
+        out
+    }
+}
+
+/// Media type of an artefact by its name.
+pub fn media_type(name: &str) -> &'static str {
+    match name.rsplit('.').next() {
+        Some("json") => "application/json",
+        Some("csv") => "text/csv; charset=utf-8",
+        Some("html") => "text/html; charset=utf-8",
+        Some("png") => "image/png",
+        Some("glb") => "model/gltf-binary",
+        Some("stl") => "model/stl",
+        Some("vtp" | "vtu") => "application/vnd.vtk+xml",
+        Some("zip") => "application/zip",
+        Some("xml") => "application/xml",
+        _ => "application/octet-stream",
+    }
+}
+
+/// Every artefact but provenance.json, in this order: result.json, angles.csv, skeleton.json, skeleton.vtp, surface.vtp,
+/// surface.glb, surface.stl, contours.vtp, report.html, preview.png.
+///
+/// # Errors
+/// [`Error::NotFinite`] for a number that is not finite, with its path; [`Error::Mismatch`] for arrays that do not fit
+/// together; [`Error::TooLarge`] beyond a format's own limit; [`Error::Encode`].
+pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
+    let contours = geometry::contour_lines(r.contours)?;
+    let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes { name, bytes: bytes? });
+    Ok(vec![
+        make(RESULT_JSON, result_json(r))?,
+        make(ANGLES_CSV, angles_csv(r))?,
+        make(SKELETON_JSON, skeleton_json(r))?,
+        make(SKELETON_VTP, skeleton_vtp(r))?,
+        make(SURFACE_VTP, surface_vtp(r))?,
+        make(SURFACE_GLB, surface_glb(r))?,
+        make(SURFACE_STL, surface_stl(r.surface.mesh))?,
+        make(CONTOURS_VTP, geometry::contours_vtp(&contours))?,
+        make(REPORT_HTML, report_html(r))?,
+        make(PREVIEW_PNG, render::thumbnail(r, PREVIEW_SIZE))?,
+    ])
+}

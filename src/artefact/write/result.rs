@@ -1,0 +1,258 @@
+//! result.json and skeleton.json: the numbers, under the names and in the order of contract.md.
+//!
+//! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
+//! `displacement_mm`, `patches` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`; `junctions[].branches`.
+//! What could not be had is null.
+
+use super::json::{Json, warning};
+use super::{Error, RESULT_JSON, SKELETON_JSON};
+use crate::Reconstruction;
+use crate::reconstruction::{CapFacts, Range};
+use morphometry::{Angle, Branch, Helix, Junction, Section, VmtkAngles};
+use skeleton::{MedialGraph, NodeKind};
+
+/// result.json.
+///
+/// # Errors
+/// [`Error::NotFinite`] with the JSON path.
+pub fn result_json(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
+    let m = r.morphometry;
+    Json::Object(vec![
+        ("schema", "vasculum/result/1".into()),
+        ("frame", "LPS".into()),
+        ("units", Json::Object(vec![("length", "mm".into()), ("angle", "deg".into())])),
+        ("input", input(r)),
+        ("segmentation", segmentation(r)),
+        ("implicit", implicit(r)),
+        ("surface", surface(r)),
+        ("graph", graph(r)),
+        ("branches", Json::List(m.branches.iter().map(branch).collect())),
+        ("junctions", Json::List(m.junctions.iter().map(junction).collect())),
+        ("warnings", Json::List(r.all_warnings().into_iter().map(warning).collect())),
+    ])
+    .print(RESULT_JSON)
+}
+
+fn input(r: &Reconstruction<'_>) -> Json {
+    let i = &r.input;
+    Json::Object(vec![
+        ("slices", i.slices.into()),
+        ("missing_slices", Json::list(i.missing_slices.iter().copied())),
+        ("spacing_mm", i.spacing_mm.into()),
+        ("digest", (&i.digest).into()),
+    ])
+}
+
+fn segmentation(r: &Reconstruction<'_>) -> Json {
+    let s = &r.segmentation;
+    let lumen = |&[slice, count]: &[usize; 2]| Json::Object(vec![("slice", slice.into()), ("count", count.into())]);
+    let candidates =
+        s.candidates.iter().map(|c| Json::Object(vec![("score", c.score.into()), ("chosen", c.chosen.into())]));
+    Json::Object(vec![
+        ("threshold", s.threshold.into()),
+        ("psf_sigma_px", s.psf_sigma_px.into()),
+        ("contours", s.contours.into()),
+        ("lumens", Json::List(s.lumens.iter().map(lumen).collect())),
+        ("axis", (&s.axis).into()),
+        ("candidates", Json::List(candidates.collect())),
+    ])
+}
+
+fn implicit(r: &Reconstruction<'_>) -> Json {
+    let f = &r.implicit;
+    Json::Object(vec![
+        ("constraints", f.constraints.into()),
+        ("smoothing", f.smoothing.into()),
+        ("residual_max_mm", f.residual_max_mm.into()),
+        ("residual_rms_mm", f.residual_rms_mm.into()),
+        ("condition", f.condition.into()),
+        ("offset_mm", f.offset_mm.into()),
+    ])
+}
+
+fn range(x: Range) -> Json {
+    Json::Object(vec![("min", x.min.into()), ("max", x.max.into()), ("rms", x.rms.into())])
+}
+
+fn surface(r: &Reconstruction<'_>) -> Json {
+    let s = &r.surface;
+    let q = &s.quality;
+    let patches = s.patches.map(|p| p.patch_id.iter().max().map_or(0, |&m| m as usize + 1));
+    Json::Object(vec![
+        ("vertices", s.mesh.vertices.len().into()),
+        ("triangles", s.mesh.triangles.len().into()),
+        ("area_mm2", q.area_mm2.into()),
+        ("volume_mm3", q.volume_mm3.into()),
+        ("min_angle_deg", q.min_angle_deg.into()),
+        ("watertight", q.watertight.into()),
+        ("euler", q.euler.into()),
+        ("components", q.components.into()),
+        ("max_error_mm", q.max_error_mm.into()),
+        ("displacement_px", range(q.displacement_px)),
+        ("displacement_mm", range(q.displacement_mm)),
+        ("max_angle_deg", q.max_angle_deg.into()),
+        ("patches", patches.into()),
+        ("caps", Json::List(q.caps.iter().map(cap).collect())),
+    ])
+}
+
+fn cap(c: &CapFacts) -> Json {
+    Json::Object(vec![
+        ("face_id", c.face_id.into()),
+        ("name", (&c.name).into()),
+        ("centroid", c.centroid.into()),
+        ("normal", c.normal.into()),
+        ("area_mm2", c.area_mm2.into()),
+    ])
+}
+
+fn node(id: usize, n: &skeleton::Node) -> Json {
+    let kind = match n.kind {
+        NodeKind::Junction => "junction",
+        NodeKind::End => "end",
+    };
+    Json::Object(vec![
+        ("id", id.into()),
+        ("kind", kind.into()),
+        ("position", n.position.into()),
+        ("radius_mm", n.radius_mm.into()),
+        ("cap", n.cap.into()),
+    ])
+}
+
+fn edge(r: &Reconstruction<'_>, id: usize, e: &skeleton::Edge) -> Vec<(&'static str, Json)> {
+    let length = e.points.windows(2).fold(0.0, |s, p| s + p[0].distance(p[1]));
+    let branch = r.morphometry.branches.iter().find(|b| b.id == id).map(|b| b.id);
+    vec![("id", id.into()), ("nodes", Json::list(e.nodes)), ("branch", branch.into()), ("length_mm", length.into())]
+}
+
+fn graph(r: &Reconstruction<'_>) -> Json {
+    let g = r.graph;
+    Json::Object(vec![
+        ("nodes", Json::List(g.nodes.iter().enumerate().map(|(i, n)| node(i, n)).collect())),
+        ("edges", Json::List(g.edges.iter().enumerate().map(|(i, e)| Json::Object(edge(r, i, e))).collect())),
+        ("cycles", g.cycles().into()),
+    ])
+}
+
+fn branch(b: &Branch) -> Json {
+    Json::Object(vec![
+        ("id", b.id.into()),
+        ("role", b.role.name().into()),
+        ("from_node", b.from_node.into()),
+        ("to_node", b.to_node.into()),
+        ("length_mm", b.length_mm.into()),
+        ("tortuosity", b.tortuosity.into()),
+        ("direction", b.direction.into()),
+        ("diameter_mm", b.diameter_mm.into()),
+        ("samples", samples(&b.sections)),
+        ("helix", b.helix.map_or(Json::Null, helix)),
+    ])
+}
+
+fn samples(sections: &[Section]) -> Json {
+    fn column<T: Into<Json>>(sections: &[Section], value: impl Fn(&Section) -> T) -> Json {
+        Json::list(sections.iter().map(value))
+    }
+    Json::Object(vec![
+        ("abscissa_mm", column(sections, |s| s.abscissa_mm)),
+        ("position", column(sections, |s| s.position)),
+        ("radius_inscribed_mm", column(sections, |s| s.radius_inscribed_mm)),
+        ("radius_area_mm", column(sections, Section::radius_area_mm)),
+        ("radius_hydraulic_mm", column(sections, Section::radius_hydraulic_mm)),
+        ("area_mm2", column(sections, |s| s.area_mm2)),
+        ("perimeter_mm", column(sections, |s| s.perimeter_mm)),
+        ("curvature_per_mm", column(sections, |s| s.curvature_per_mm)),
+        ("in_junction", column(sections, |s| s.in_junction)),
+        ("open", column(sections, |s| s.open)),
+        ("tangent", column(sections, |s| s.tangent)),
+    ])
+}
+
+fn helix(h: Helix) -> Json {
+    let handedness = if h.torsion_per_mm > 0.0 {
+        Json::from("right")
+    } else if h.torsion_per_mm < 0.0 {
+        Json::from("left")
+    } else {
+        Json::Null
+    };
+    Json::Object(vec![
+        ("radius_mm", h.radius_mm.into()),
+        ("pitch_mm", h.pitch_mm.into()),
+        ("curvature_per_mm", h.curvature_per_mm.into()),
+        ("torsion_per_mm", h.torsion_per_mm.into()),
+        ("torsion_band95", Json::Null),
+        ("rms_mm", h.rms_mm.into()),
+        ("handedness", handedness),
+    ])
+}
+
+fn junction(j: &Junction) -> Json {
+    Json::Object(vec![
+        ("node", j.node.into()),
+        ("medial_point", j.medial_point.into()),
+        ("axes_point", j.axes_point.into()),
+        ("plane_normal", j.plane_normal.into()),
+        ("crotch_mm", j.crotch_mm.into()),
+        ("angles", Json::List(j.angles.iter().map(angle).collect())),
+        ("vmtk", j.vmtk.as_ref().map_or(Json::Null, vmtk)),
+        ("branches", Json::list(j.branches.iter().copied())),
+    ])
+}
+
+fn angle(a: &Angle) -> Json {
+    let by_distance = a.by_distance.as_ref().map_or(Json::Null, |d| {
+        Json::Object(vec![
+            ("diameters", Json::list(d.diameters.iter().copied())),
+            ("value", Json::list(d.value_deg.iter().copied())),
+        ])
+    });
+    Json::Object(vec![
+        ("name", (&a.name).into()),
+        ("value", a.value_deg.into()),
+        ("band95", a.band95_deg.into()),
+        ("window_diameters", a.window_diameters.into()),
+        ("by_distance", by_distance),
+    ])
+}
+
+fn vmtk(v: &VmtkAngles) -> Json {
+    Json::Object(vec![
+        ("in_plane", Json::list(v.in_plane_deg.iter().copied())),
+        ("out_of_plane", Json::list(v.out_of_plane_deg.iter().copied())),
+    ])
+}
+
+/// skeleton.json: the medial graph as a node-link document (the layout of networkx.node_link_graph with
+/// `edges="links"`: `nodes` with `id`, `links` with `source`, `target` and `key`, a multigraph because a vessel tree
+/// may have parallel branches), with the points and the inscribed radius along every link.
+///
+/// # Errors
+/// [`Error::NotFinite`] with the JSON path.
+pub fn skeleton_json(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
+    let g: &MedialGraph = r.graph;
+    let links = g.edges.iter().enumerate().map(|(i, e)| {
+        let mut members = vec![
+            ("source", e.nodes[0].into()),
+            ("target", e.nodes[1].into()),
+            ("key", i.into()),
+            ("role", r.role_of_edge(i).map(morphometry::Role::name).into()),
+        ];
+        members.extend(edge(r, i, e));
+        members.push(("points", Json::list(e.points.iter().copied())));
+        members.push(("radius_mm", Json::list(e.radius_mm.iter().copied())));
+        Json::Object(members)
+    });
+    Json::Object(vec![
+        ("schema", "vasculum/skeleton/1".into()),
+        ("frame", "LPS".into()),
+        ("units", Json::Object(vec![("length", "mm".into())])),
+        ("directed", false.into()),
+        ("multigraph", true.into()),
+        ("graph", Json::Object(vec![("cycles", g.cycles().into())])),
+        ("nodes", Json::List(g.nodes.iter().enumerate().map(|(i, n)| node(i, n)).collect())),
+        ("links", Json::List(links.collect())),
+    ])
+    .print(SKELETON_JSON)
+}
