@@ -1,1 +1,32 @@
-fn main() {}
+//! `vasculum`: parse the arguments, build the configuration, call one function per sub-command.
+
+mod arguments;
+mod demo;
+mod jobs;
+mod phantoms;
+mod serving;
+mod table;
+
+use arguments::{Arguments, Command};
+use clap::Parser;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    match arguments.command {
+        Command::Run(a) => jobs::run(&a),
+        Command::Validate(a) => jobs::validate(&a),
+        Command::ExecJob(a) => jobs::exec(&a),
+        Command::Phantom(a) => phantoms::write(&a),
+        Command::Serve(a) => serving::serve(a),
+        Command::Work(a) => serving::work(a),
+        Command::Migrate(a) => serving::migrate(a),
+        Command::Key(a) => serving::key(a),
+        Command::Demo(a) => demo::demo(&a),
+        Command::Openapi => serving::openapi(),
+        Command::Version => {
+            println!("vasculum {}", env!("CARGO_PKG_VERSION"));
+            ExitCode::SUCCESS
+        }
+    }
+}

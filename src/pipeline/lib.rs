@@ -1,1 +1,12 @@
-//! pipeline
+//! The paper as one function: [`run`] reads like its section 3. Knows no HTTP, user or queue; the command line and the
+//! service's worker both call it.
+
+mod facts;
+mod failure;
+mod folder;
+mod reconstruct;
+mod step;
+
+pub use failure::Failure;
+pub use reconstruct::{run, validate};
+pub use step::{Event, Observer};

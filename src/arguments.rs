@@ -1,0 +1,195 @@
+//! The command line (names fixed by the contract with our users).
+
+use clap::{Args, Parser, Subcommand};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// Reconstructs blood vessels and their bifurcations from stacks of MRI or CT slices.
+#[derive(Parser)]
+#[command(name = "vasculum", version, about, arg_required_else_help = true)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Subcommand)]
+pub(crate) enum Command {
+    /// API, portal and workers in one process tree.
+    Serve(Serve),
+    /// A worker without API against the same database and store.
+    Work(Serve),
+    /// The whole reconstruction without a service.
+    Run(Run),
+    /// Read and check a scan and a plan; nothing is reconstructed.
+    Validate(Validate),
+    /// A simulated scan with exact truth: DICOM, PNG + plan, NIfTI, truth.json.
+    Phantom(Phantom),
+    /// Start the service, reconstruct a simulated scan through it, show the angles beside the truth.
+    Demo(Demo),
+    /// Bring the database to this version's schema.
+    Migrate(Data),
+    /// API keys.
+    Key(Key),
+    /// Print the API's description (OpenAPI 3.1, YAML).
+    Openapi,
+    /// Print the version.
+    Version,
+    /// One job of a worker (its parent speaks to it over standard input and output).
+    #[command(hide = true)]
+    ExecJob(ExecJob),
+}
+
+#[derive(Args)]
+pub(crate) struct Data {
+    /// Database, artefacts and working folders live here.
+    #[arg(long, default_value = "vasculum-data", env = "VASCULUM_DATA_DIR")]
+    pub(crate) data_dir: PathBuf,
+    /// sqlite:PATH (default: inside the data folder).
+    #[arg(long, env = "VASCULUM_DATABASE_URL")]
+    pub(crate) database_url: Option<String>,
+    /// file:PATH (default: inside the data folder).
+    #[arg(long, env = "VASCULUM_STORE_URL")]
+    pub(crate) store_url: Option<String>,
+}
+
+#[derive(Args)]
+pub(crate) struct Serve {
+    #[command(flatten)]
+    pub(crate) data: Data,
+    /// Address of the API and the portal; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:8080", env = "VASCULUM_LISTEN")]
+    pub(crate) listen: SocketAddr,
+    /// Jobs at the same time.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) workers: usize,
+    /// Threads of each job (default: all cores; results do not depend on it).
+    #[arg(long)]
+    pub(crate) threads: Option<usize>,
+    /// No API keys: only on a loopback address.
+    #[arg(long)]
+    pub(crate) no_auth: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Key {
+    #[command(subcommand)]
+    pub(crate) action: KeyAction,
+}
+
+#[derive(Subcommand)]
+pub(crate) enum KeyAction {
+    /// Make a key and print it; it is shown only this once.
+    Create {
+        #[command(flatten)]
+        data: Data,
+        /// What the key is for.
+        #[arg(long, default_value = "key")]
+        name: String,
+    },
+}
+
+#[derive(Args)]
+pub(crate) struct Run {
+    /// A folder, a zip, DICOM files, one volume file, or grey slices in name order.
+    #[arg(required = true)]
+    pub(crate) input: Vec<PathBuf>,
+    /// Folder for the artefacts; it appears whole or not at all.
+    #[arg(long)]
+    pub(crate) out: PathBuf,
+    /// plan.json.
+    #[arg(long)]
+    pub(crate) plan: Option<PathBuf>,
+    /// Threads (default: all cores; the bytes do not depend on it).
+    #[arg(long)]
+    pub(crate) threads: Option<usize>,
+    /// Results and errors as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Validate {
+    /// As for `run`.
+    #[arg(required = true)]
+    pub(crate) input: Vec<PathBuf>,
+    /// plan.json.
+    #[arg(long)]
+    pub(crate) plan: Option<PathBuf>,
+    /// Threads (default: all cores).
+    #[arg(long)]
+    pub(crate) threads: Option<usize>,
+    /// What was understood, or the fault, as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct ExecJob {
+    #[arg(long)]
+    pub(crate) input: PathBuf,
+    #[arg(long)]
+    pub(crate) plan: PathBuf,
+    #[arg(long)]
+    pub(crate) out: PathBuf,
+    #[arg(long, default_value_t = 0)]
+    pub(crate) threads: usize,
+}
+
+#[derive(Args)]
+pub(crate) struct Phantom {
+    /// anastomosis, tube, helix, trifurcation, or random (drawn from the seed).
+    pub(crate) kind: String,
+    /// Folder to write.
+    #[arg(long)]
+    pub(crate) out: PathBuf,
+    #[command(flatten)]
+    pub(crate) image: Image,
+}
+
+/// What of a simulated scan may be set.
+#[derive(Args, Default)]
+pub(crate) struct Image {
+    /// Noise (and, for `random`, the shape).
+    #[arg(long)]
+    pub(crate) seed: Option<u64>,
+    /// Contrast of lumen against tissue over the noise's sigma.
+    #[arg(long)]
+    pub(crate) snr: Option<f64>,
+    /// Pixels per row and rows per slice.
+    #[arg(long)]
+    pub(crate) size: Option<usize>,
+    /// Number of slices.
+    #[arg(long)]
+    pub(crate) slices: Option<usize>,
+    /// Pixel size, mm.
+    #[arg(long)]
+    pub(crate) pixel: Option<f64>,
+    /// Distance between slices, mm.
+    #[arg(long)]
+    pub(crate) spacing: Option<f64>,
+    /// Slice thickness, mm (default: the spacing).
+    #[arg(long)]
+    pub(crate) thickness: Option<f64>,
+    /// Unrelated bright vessels.
+    #[arg(long)]
+    pub(crate) distractors: Option<usize>,
+    /// Turn the vessel against the slices, degrees.
+    #[arg(long)]
+    pub(crate) tilt: Option<f64>,
+    /// Slices to leave out, by number, separated by commas.
+    #[arg(long, value_delimiter = ',')]
+    pub(crate) missing: Vec<usize>,
+}
+
+#[derive(Args)]
+pub(crate) struct Demo {
+    /// Folder for the artefacts.
+    #[arg(long, default_value = "demo")]
+    pub(crate) out: PathBuf,
+    /// Noise seed.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Keep the service running afterwards (the default when a person is at the terminal).
+    #[arg(long)]
+    pub(crate) keep: bool,
+}

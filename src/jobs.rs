@@ -1,0 +1,168 @@
+//! `run`, `validate` and `exec-job`: the pipeline in this process.
+
+use crate::arguments::{ExecJob, Run, Validate};
+use crate::table;
+use artefact::plan::Plan;
+use artefact::problem::Problem;
+use exec::Ctx;
+use indicatif::{ProgressBar, ProgressStyle};
+use pipeline::{Event, Failure};
+use serde_json::{Value, json};
+use std::io::{IsTerminal, Read, Write};
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Mutex;
+
+/// The whole reconstruction into a folder.
+pub(crate) fn run(a: &Run) -> ExitCode {
+    let outcome = plan_of(a.plan.as_deref()).and_then(|plan| {
+        let ctx = context(a.threads)?;
+        let shown = Shown::new();
+        let outcome = pipeline::run(&a.input, &plan, &a.out, &ctx, &|e| shown.show(e));
+        shown.finish();
+        outcome
+    });
+    match outcome {
+        Ok(result) => {
+            print!("{}", if a.json { format!("{result}\n") } else { summary(&result, &a.out) });
+            ExitCode::SUCCESS
+        }
+        Err(failure) => report(&failure, a.json),
+    }
+}
+
+/// What was understood of a scan and a plan.
+pub(crate) fn validate(a: &Validate) -> ExitCode {
+    let outcome = plan_of(a.plan.as_deref()).and_then(|plan| pipeline::validate(&a.input, &plan, &context(a.threads)?));
+    match outcome {
+        Ok(understood) if a.json => {
+            println!("{understood:#}");
+            ExitCode::SUCCESS
+        }
+        Ok(understood) => {
+            print!("{}", words(&understood, 0));
+            ExitCode::SUCCESS
+        }
+        Err(failure) => report(&failure, a.json),
+    }
+}
+
+/// One job of a worker: progress as JSON lines on standard output; ends when standard input closes, so that a killed
+/// worker leaves no job running.
+pub(crate) fn exec(a: &ExecJob) -> ExitCode {
+    let outcome = plan_of(Some(&a.plan)).and_then(|plan| {
+        let ctx = context(Some(a.threads))?;
+        die_with_parent();
+        pipeline::run(std::slice::from_ref(&a.input), &plan, &a.out, &ctx, &|e| {
+            line(&json!({"stage": e.stage, "progress": e.progress, "eta_s": e.eta_s}));
+        })
+    });
+    match outcome {
+        Ok(_) => ExitCode::SUCCESS,
+        Err(failure) => {
+            line(&json!({"error": Problem::from_fault(&failure)}));
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+/// A closed pipe means that the parent is gone; a line that cannot be written says the same.
+fn line(value: &Value) {
+    let mut out = std::io::stdout().lock();
+    if writeln!(out, "{value}").and_then(|()| out.flush()).is_err() {
+        std::process::exit(1);
+    }
+}
+
+fn die_with_parent() {
+    std::thread::spawn(|| {
+        let mut byte = [0_u8; 64];
+        while std::io::stdin().read(&mut byte).is_ok_and(|n| n > 0) {}
+        std::process::exit(1);
+    });
+}
+
+fn context(threads: Option<usize>) -> Result<Ctx, Failure> {
+    Ctx::new(threads.unwrap_or(0)).map_err(Failure::internal)
+}
+
+fn plan_of(path: Option<&Path>) -> Result<Plan, Failure> {
+    let Some(path) = path else { return Ok(Plan::default()) };
+    let bytes = std::fs::read(path).map_err(|e| Failure::unreadable(path, &e))?;
+    Plan::parse(&bytes).map_err(Failure::plan)
+}
+
+fn report(failure: &Failure, as_json: bool) -> ExitCode {
+    if as_json {
+        eprintln!("{}", Problem::from_fault(failure).json());
+    } else {
+        eprintln!("vasculum: {}", Problem::from_fault(failure).words());
+    }
+    ExitCode::from(failure.kind.exit_code())
+}
+
+fn summary(result: &Value, out: &Path) -> String {
+    let mut text = table::angles(result, None);
+    for warning in result["warnings"].as_array().map(Vec::as_slice).unwrap_or_default() {
+        text += &format!(
+            "warning {}: {}\n",
+            warning["code"].as_str().unwrap_or("?"),
+            warning["message"].as_str().unwrap_or("")
+        );
+    }
+    text + &format!("artefacts in {}\n", out.display())
+}
+
+/// A JSON object as indented lines.
+fn words(value: &Value, depth: usize) -> String {
+    let indent = "  ".repeat(depth);
+    match value {
+        Value::Object(members) => members
+            .iter()
+            .map(|(name, v)| match v {
+                Value::Object(_) => format!("{indent}{name}\n{}", words(v, depth + 1)),
+                Value::Array(items) if items.iter().any(Value::is_object) => {
+                    let lines: String = items.iter().map(|i| format!("{indent}  - {i}\n")).collect();
+                    format!("{indent}{name}\n{lines}")
+                }
+                _ => format!("{indent}{name}: {v}\n"),
+            })
+            .collect(),
+        other => format!("{indent}{other}\n"),
+    }
+}
+
+/// A bar on a terminal, one line per stage elsewhere.
+struct Shown {
+    bar: Option<ProgressBar>,
+    stage: Mutex<String>,
+}
+
+impl Shown {
+    fn new() -> Self {
+        let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %").unwrap_or_else(|_| ProgressStyle::default_bar());
+        let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(1000).with_style(style));
+        Self { bar, stage: Mutex::default() }
+    }
+    fn show(&self, e: &Event<'_>) {
+        let Ok(mut stage) = self.stage.lock() else { return };
+        let is_new = *stage != e.stage;
+        if is_new {
+            e.stage.clone_into(&mut stage);
+        }
+        match &self.bar {
+            Some(bar) => {
+                let left = e.eta_s.map_or(String::new(), |s| format!(" {s:.0} s"));
+                bar.set_message(format!("{}{left}", e.stage));
+                bar.set_position((e.progress * 1000.0) as u64);
+            }
+            None if is_new => eprintln!("{}", e.stage),
+            None => {}
+        }
+    }
+    fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage.
+
+use crate::{shell, tools};
+use anyhow::{Context, Result, ensure};
+use serde_json::Value;
+use std::fs;
+use std::path::Path;
+
+/// Reconstruct the demo scan `repeat` times and show medians.
+pub(crate) fn run(binary: &Path, repeat: usize) -> Result<()> {
+    ensure!(repeat > 0, "at least one repetition");
+    let work = tools::target()?.join("bench-whole");
+    if work.exists() {
+        fs::remove_dir_all(&work)?;
+    }
+    let scan = work.join("scan");
+    let mut phantom = shell::command(binary);
+    phantom.args(["phantom", "anastomosis", "--out"]).arg(&scan);
+    shell::run(phantom)?;
+    let mut runs = Vec::new();
+    for k in 0..repeat {
+        let out = work.join(format!("out{k}"));
+        let mut run = shell::command(binary);
+        run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json")).arg("--out").arg(&out);
+        ensure!(shell::succeeds(run), "the reconstruction failed");
+        runs.push(serde_json::from_slice::<Value>(&fs::read(out.join("provenance.json"))?)?);
+    }
+    show(&runs)?;
+    fs::remove_dir_all(&work)?;
+    Ok(())
+}
+
+fn show(runs: &[Value]) -> Result<()> {
+    let stages = runs[0]["stages"].as_array().context("provenance has stages")?;
+    println!("{:<14} {:>9} {:>9}", "stage", "wall s", "CPU s");
+    for (k, stage) in stages.iter().enumerate() {
+        let median_of = |name: &str| median(runs.iter().filter_map(|r| r["stages"][k][name].as_f64()).collect());
+        let name = stage["name"].as_str().unwrap_or("?");
+        println!("{name:<14} {:>9.2} {:>9.2}", median_of("wall_s"), median_of("cpu_s"));
+    }
+    let whole = |name: &str| median(runs.iter().filter_map(|r| r[name].as_f64()).collect());
+    println!("{:<14} {:>9.2} {:>9.2}", "whole", whole("wall_s"), whole("cpu_s"));
+    println!("peak memory {:.0} MiB (medians of {})", whole("peak_memory_bytes") / 1_048_576.0, runs.len());
+    Ok(())
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}

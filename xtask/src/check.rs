@@ -1,0 +1,88 @@
+//! `cargo xtask test`: every check, in the order in which a failure costs least.
+
+use crate::{shell, survey, tools};
+use anyhow::{Result, bail};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Noise seeds of the demo scan that the test command reconstructs (the survey runs ten).
+const SEEDS: u64 = 3;
+
+/// Run all checks.
+pub(crate) fn all() -> Result<()> {
+    tools::compiler()?;
+    tools::node()?;
+    lint()?;
+    let mut test = shell::command("cargo");
+    test.args(["test", "--workspace", "--quiet"]);
+    shell::run(test)?;
+    let binary = tools::release_binary()?;
+    let work = fresh_folder()?;
+    judges(&binary, &work)?;
+    survey::run(&binary, 1, SEEDS)?;
+    fs::remove_dir_all(&work)?;
+    eprintln!("xtask: all checks passed");
+    Ok(())
+}
+
+fn lint() -> Result<()> {
+    let mut format = shell::command("cargo");
+    format.args(["fmt", "--all", "--check"]);
+    shell::run(format)?;
+    let mut clippy = shell::command("cargo");
+    clippy.args(["clippy", "--workspace", "--all-targets", "--quiet", "--", "-D", "warnings"]);
+    shell::run(clippy)
+}
+
+fn fresh_folder() -> Result<PathBuf> {
+    let work = tools::target()?.join("judges");
+    if work.exists() {
+        fs::remove_dir_all(&work)?;
+    }
+    fs::create_dir_all(&work)?;
+    Ok(work)
+}
+
+/// Programs that we did not write read what we write.
+fn judges(binary: &Path, work: &Path) -> Result<()> {
+    let (scan, out) = (work.join("scan"), work.join("out"));
+    let mut phantom = shell::command(binary);
+    phantom.args(["phantom", "anastomosis", "--seed", "1", "--out"]).arg(&scan);
+    shell::run(phantom)?;
+    let mut run = shell::command(binary);
+    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json")).arg("--out").arg(&out);
+    shell::run(run)?;
+    let python = tools::python()?;
+    for script in scripts("tests/python", "py")? {
+        let mut judge = shell::command(&python);
+        judge.arg(script).env("VASCULUM_BIN", binary).env("VASCULUM_OUT", &out).env("VASCULUM_SCAN", &scan);
+        shell::run(judge)?;
+    }
+    let node = tools::node_packages()?;
+    tools::browser()?;
+    for script in scripts("tests/js", "mjs")? {
+        // modules resolve packages from their own folder: run a copy beside node_modules
+        let copy = node.join(script.file_name().unwrap_or_default());
+        fs::copy(&script, &copy)?;
+        let mut judge = shell::command("node");
+        judge.arg(&copy).env("VASCULUM_BIN", binary).env("VASCULUM_OUT", &out).env("VASCULUM_SCAN", &scan);
+        judge.env("VASCULUM_WORK", work);
+        shell::run(judge)?;
+    }
+    Ok(())
+}
+
+fn scripts(folder: &str, extension: &str) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(shell::root()?.join(folder))? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|e| e == extension) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    if found.is_empty() {
+        bail!("no checks in {folder}");
+    }
+    Ok(found)
+}

@@ -1,0 +1,48 @@
+//! Running programs: every command is shown before it runs, and a failure names it.
+
+use anyhow::{Context, Result, bail};
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// The workspace's root.
+pub(crate) fn root() -> Result<PathBuf> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    Ok(here.parent().context("xtask lies in the workspace")?.to_path_buf())
+}
+
+/// A command that runs in the workspace's root.
+pub(crate) fn command(program: impl AsRef<OsStr>) -> Command {
+    let mut command = Command::new(program);
+    if let Ok(root) = root() {
+        command.current_dir(root);
+    }
+    command
+}
+
+/// Show and run; an exit code other than 0 is an error.
+pub(crate) fn run(mut command: Command) -> Result<()> {
+    eprintln!("+ {}", words(&command));
+    let status = command.status().with_context(|| format!("cannot start {}", words(&command)))?;
+    if !status.success() {
+        bail!("{} ended with {status}", words(&command));
+    }
+    Ok(())
+}
+
+/// Run quietly; whether it started and exited with 0.
+pub(crate) fn succeeds(mut command: Command) -> bool {
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
+}
+
+/// Whether a program can be started.
+pub(crate) fn has(program: &str) -> bool {
+    let mut c = Command::new(program);
+    c.arg("--version");
+    succeeds(c)
+}
+
+fn words(command: &Command) -> String {
+    let args = command.get_args().map(|a| a.to_string_lossy().into_owned());
+    std::iter::once(command.get_program().to_string_lossy().into_owned()).chain(args).collect::<Vec<_>>().join(" ")
+}

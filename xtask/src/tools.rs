@@ -1,0 +1,142 @@
+//! What the build and the tests need, installed into the project's own `.tools` folder where that is possible.
+//!
+//! A stamp with the list of packages makes a second run immediate.
+
+use crate::shell;
+use anyhow::{Context, Result, bail};
+use std::fs;
+use std::path::PathBuf;
+
+/// Programs that judge our files; versions are pinned so that a green run stays green.
+const PYTHON_PACKAGES: &[&str] = &[
+    "numpy",
+    "vtk==9.5.2",
+    "pydicom==3.0.2",
+    "nibabel==5.4.2",
+    "SimpleITK==2.5.7",
+    "openapi-spec-validator==0.7.2",
+    "jsonschema<5",
+    "PyYAML",
+];
+const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1"];
+
+/// Build the release binary (with the portal) and give its path.
+pub(crate) fn release_binary() -> Result<PathBuf> {
+    compiler()?;
+    node()?;
+    let mut build = shell::command("cargo");
+    build.args(["build", "--release", "--package", "vasculum"]);
+    shell::run(build)?;
+    Ok(target()?.join("release/vasculum"))
+}
+
+/// Cargo's target folder.
+pub(crate) fn target() -> Result<PathBuf> {
+    match std::env::var_os("CARGO_TARGET_DIR") {
+        Some(dir) => Ok(shell::root()?.join(dir)),
+        None => Ok(shell::root()?.join("target")),
+    }
+}
+
+/// The folder of the project's own tools.
+pub(crate) fn folder() -> Result<PathBuf> {
+    let dir = match std::env::var_os("VASCULUM_TOOLS") {
+        Some(dir) => PathBuf::from(dir),
+        None => shell::root()?.join(".tools"),
+    };
+    fs::create_dir_all(&dir).with_context(|| format!("cannot make {}", dir.display()))?;
+    Ok(dir)
+}
+
+/// SQLite is built from C.
+pub(crate) fn compiler() -> Result<()> {
+    if shell::has("cc") {
+        return Ok(());
+    }
+    apt("a C compiler (SQLite is compiled from source)", &["build-essential"])
+}
+
+/// The portal's 3D view is bundled by npm. Without it everything else works, so that a failure here is only said.
+pub(crate) fn node() -> Result<()> {
+    if shell::has("npm") {
+        return Ok(());
+    }
+    if let Err(e) = apt("Node.js (the portal's 3D view is bundled with it)", &["nodejs", "npm"]) {
+        eprintln!("xtask: {e:#}; the portal is built without its 3D view");
+    }
+    Ok(())
+}
+
+/// Headless browser for the portal's test.
+pub(crate) fn browser() -> Result<()> {
+    if shell::has("chromium") {
+        return Ok(());
+    }
+    apt("Chromium (the portal's pages are opened in it)", &["chromium"])
+}
+
+/// Python with the judges; the path of its interpreter.
+pub(crate) fn python() -> Result<PathBuf> {
+    if !shell::has("python3") || !python_has_venv() {
+        apt("Python with venv (programs that judge our files)", &["python3", "python3-venv"])?;
+    }
+    let venv = folder()?.join("venv");
+    let interpreter = venv.join("bin/python");
+    let wanted = PYTHON_PACKAGES.join("\n");
+    let stamp = venv.join("packages.txt");
+    if fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
+        return Ok(interpreter);
+    }
+    let mut make = shell::command("python3");
+    make.args(["-m", "venv", "--clear"]).arg(&venv);
+    shell::run(make)?;
+    let mut install = shell::command(&interpreter);
+    install.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]).args(PYTHON_PACKAGES);
+    shell::run(install)?;
+    fs::write(&stamp, wanted)?;
+    Ok(interpreter)
+}
+
+fn python_has_venv() -> bool {
+    let mut c = shell::command("python3");
+    c.args(["-c", "import venv, ensurepip"]);
+    shell::succeeds(c)
+}
+
+/// Node packages for the tests; the folder that holds `node_modules`.
+pub(crate) fn node_packages() -> Result<PathBuf> {
+    node()?;
+    let dir = folder()?.join("node");
+    fs::create_dir_all(&dir)?;
+    let wanted = NODE_PACKAGES.join("\n");
+    let stamp = dir.join("packages.txt");
+    if fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
+        return Ok(dir);
+    }
+    fs::write(dir.join("package.json"), "{\"private\": true}\n")?;
+    let mut install = shell::command("npm");
+    install.args(["install", "--no-audit", "--no-fund", "--loglevel=error"]).args(NODE_PACKAGES).current_dir(&dir);
+    shell::run(install)?;
+    fs::write(&stamp, wanted)?;
+    Ok(dir)
+}
+
+/// Install Debian packages, as root or through sudo.
+fn apt(what: &str, packages: &[&str]) -> Result<()> {
+    eprintln!("xtask: installing {what}: {}", packages.join(" "));
+    if !shell::has("apt-get") {
+        bail!("{what} is missing and there is no apt-get: install {} by hand", packages.join(" "));
+    }
+    let mut whoami = std::process::Command::new("id");
+    whoami.arg("-u");
+    let root = whoami.output().is_ok_and(|o| o.stdout.starts_with(b"0"));
+    for arguments in [vec!["update", "-qq"], [vec!["install", "-y", "-qq", "--no-install-recommends"], packages.to_vec()].concat()] {
+        let mut command = shell::command(if root { "apt-get" } else { "sudo" });
+        if !root {
+            command.arg("apt-get");
+        }
+        command.args(arguments).env("DEBIAN_FRONTEND", "noninteractive");
+        shell::run(command).with_context(|| format!("{what} could not be installed"))?;
+    }
+    Ok(())
+}
