@@ -2,6 +2,7 @@
 
 pub mod plan;
 pub mod problem;
+pub mod read;
 pub mod reconstruction;
 pub mod write;
 

@@ -1,4 +1,14 @@
-//! plan.json: what the user may ask for (contract.md). Every field is optional.
+//! plan.json: what the user may ask for (contract.md). Every field is optional; `null` is as if absent.
+//!
+//! [`Plan::parse`] reports every fault at once, each with its dotted path, so that a plan is mended in one go. Ranges are
+//! checked here and not in the stages: a plan that parses is a plan that can be run.
+
+mod check;
+mod convert;
+#[cfg(test)]
+mod tests;
+
+pub use check::{PlanFault, PlanFaults};
 
 use serde::{Deserialize, Serialize};
 

@@ -5,12 +5,16 @@
 //! Everything is made in memory before a byte is written, so that a fault in the last artefact leaves nothing behind.
 
 mod csv;
+pub mod dicom;
 mod error;
 mod geometry;
 mod glb;
 mod html;
 mod json;
+pub mod metaimage;
+pub mod nifti;
 mod plot;
+pub mod png;
 mod provenance;
 pub mod render;
 mod result;
