@@ -22,6 +22,8 @@ mod kind;
 mod random;
 mod scene;
 mod settings;
+#[cfg(test)]
+mod tests;
 mod tissue;
 mod truth;
 mod vessel;

@@ -38,9 +38,9 @@ pub enum Body {
 /// Settings of a simulated scan. Lengths in mm, angles in degrees.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Pixels per row, 16..=4096. Default 256.
+    /// Pixels per row, 16..=2048. Default 256.
     pub columns: usize,
-    /// Rows, 16..=4096. Default 256.
+    /// Rows, 16..=2048. Default 256.
     pub rows: usize,
     /// Slices before some are left out, 1..=4096. Default 44: with 1.5 mm they hold 32 mm of the host on each side of
     /// the junction, 6.4 graft diameters.
@@ -172,8 +172,8 @@ impl Settings {
                 faults.push(SettingFault { field, reason: format!("is {value} and must lie within {low} to {high}") });
             }
         };
-        within("columns", self.columns as f64, 16.0, 4096.0);
-        within("rows", self.rows as f64, 16.0, 4096.0);
+        within("columns", self.columns as f64, 16.0, 2048.0);
+        within("rows", self.rows as f64, 16.0, 2048.0);
         within("slices", self.slices as f64, 1.0, 4096.0);
         within("pixel_mm", self.pixel_mm, 0.05, 10.0);
         within("slice_spacing_mm", self.slice_spacing_mm, 0.05, 20.0);
