@@ -64,6 +64,10 @@ impl Ctx {
         let (a, b) = self.range;
         (self.sink)(a + (b - a) * fraction.clamp(0.0, 1.0));
     }
+    /// Number of threads of the pool.
+    pub fn threads(&self) -> usize {
+        self.pool.current_num_threads()
+    }
     /// Ask all work under this context to stop.
     pub fn cancel(&self) {
         self.cancel.store(true, Ordering::Relaxed);

@@ -1,6 +1,6 @@
 //! Any stage's error, carried to the process's edge.
 
-use artefact::plan::PlanFaults;
+use artefact::plan::{PlanFault, PlanFaults};
 use space::{FaultKind, Faulty, Place};
 use std::path::Path;
 
@@ -31,13 +31,21 @@ impl Failure {
     }
     /// A plan's faults, the first one leading.
     pub fn plan(faults: PlanFaults) -> Self {
-        let mut all: Vec<Self> = faults.0.iter().map(|f| Self::of(f)).collect();
+        let mut all: Vec<Self> = faults.faults.iter().map(Self::of_plan).collect();
         if all.is_empty() {
             return Self::internal("a plan was refused without a fault");
         }
         let mut first = all.remove(0);
         first.others = all;
         first
+    }
+    fn of_plan(fault: &PlanFault) -> Self {
+        let kind = if fault.code == "plan.too_large" { FaultKind::Limit } else { FaultKind::Input };
+        let mut failure = Self::new(kind, fault.code, fault.message.clone());
+        if !fault.field.is_empty() {
+            failure.place = Place::field(&fault.field);
+        }
+        failure
     }
     /// A file that cannot be read.
     pub fn unreadable(path: &Path, e: &std::io::Error) -> Self {

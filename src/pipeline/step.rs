@@ -26,6 +26,8 @@ pub(crate) struct StageTime {
     pub(crate) name: &'static str,
     pub(crate) wall_s: f64,
     pub(crate) cpu_s: f64,
+    /// Largest resident size of the process by its end, bytes.
+    pub(crate) peak_bytes: u64,
 }
 
 /// Runs stages one after the other.
@@ -69,7 +71,8 @@ impl<'a> Steps<'a> {
         let (wall, cpu) = (Instant::now(), cpu_seconds());
         let latest = Arc::new(Mutex::new(0.0_f64));
         let outcome = self.watched(name, (from, to), &latest, work);
-        self.times.push(StageTime { name, wall_s: wall.elapsed().as_secs_f64(), cpu_s: cpu_seconds() - cpu });
+        let (wall_s, cpu_s) = (wall.elapsed().as_secs_f64(), cpu_seconds() - cpu);
+        self.times.push(StageTime { name, wall_s, cpu_s, peak_bytes: peak_memory_bytes() });
         self.done = to;
         outcome.map_err(|e| Failure::of(&e))
     }

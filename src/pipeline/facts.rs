@@ -1,0 +1,110 @@
+//! The stages' reports in the words of the artefacts.
+
+use crate::reconstruct::Wall;
+use crate::step::StageTime;
+use artefact::read::InputReport;
+use artefact::reconstruction::{
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Range, SegmentationFacts, SurfaceFacts,
+};
+use imaging::{Axis, Contours};
+use morphometry::{Morphometry, Role};
+use skeleton::MedialGraph;
+
+pub(crate) fn input(r: &InputReport) -> InputFacts {
+    InputFacts {
+        slices: r.slices,
+        missing_slices: r.missing_slices.clone(),
+        spacing_mm: r.spacing_mm,
+        digest: r.digest.clone(),
+    }
+}
+
+pub(crate) fn segmentation(contours: &Contours, r: &imaging::Report) -> SegmentationFacts {
+    SegmentationFacts {
+        threshold: Some(r.threshold),
+        psf_sigma_px: r.psf_sigma_px,
+        contours: contours.curves.len(),
+        lumens: r.lumens.iter().map(|&(plane, count)| [plane, count]).collect(),
+        axis: axis(contours.axis).to_owned(),
+        candidates: r.candidates.iter().map(|c| Candidate { score: c.score, chosen: c.chosen }).collect(),
+    }
+}
+
+fn axis(axis: Axis) -> &'static str {
+    match axis {
+        Axis::Slice => "slice",
+        Axis::Row => "row",
+        Axis::Column => "column",
+    }
+}
+
+pub(crate) fn implicit(r: &implicit::FitReport) -> ImplicitFacts {
+    ImplicitFacts {
+        constraints: r.constraints,
+        smoothing: r.smoothing,
+        residual_max_mm: r.residual_max_mm,
+        residual_rms_mm: r.residual_rms_mm,
+        condition: Some(r.condition),
+        offset_mm: r.offset_mm,
+    }
+}
+
+pub(crate) fn surface(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceFacts {
+    let d = &wall.displacement;
+    let pixel = |mm: f64, px: f64| if px == 0.0 { 0.0 } else { mm / px };
+    let mm_per_px = d.mm.iter().zip(&d.px).map(|(&mm, &px)| pixel(mm, px)).find(|s| *s > 0.0).unwrap_or(0.0);
+    SurfaceFacts {
+        min_angle_deg: wall.quality.min_angle_deg,
+        max_angle_deg: wall.quality.max_angle_deg,
+        watertight: true,
+        euler: wall.topology.euler as i64,
+        components: wall.topology.components,
+        max_error_mm: wall.quality.face_max_mm,
+        area_mm2: wall.mesh.area(),
+        volume_mm3: wall.mesh.volume(),
+        displacement_px: Range { min: d.min_px, max: d.max_px, rms: d.rms_px },
+        displacement_mm: Range { min: d.min_px * mm_per_px, max: d.max_px * mm_per_px, rms: d.rms_px * mm_per_px },
+        caps: wall.caps.iter().map(|c| cap(c, graph, morphometry)).collect(),
+    }
+}
+
+/// A cap is named by the role of the branch that ends there.
+fn cap(c: &surface::Cap, graph: &MedialGraph, morphometry: &Morphometry) -> CapFacts {
+    let node = graph.nodes.iter().position(|n| n.cap == Some(c.face_id));
+    let branch = morphometry.branches.iter().find(|b| node.is_some_and(|n| b.from_node == n || b.to_node == n));
+    let name = match branch.map(|b| (b.role, b.id)) {
+        Some((Role::Other, id)) => format!("end_branch_{id}"),
+        Some((role, _)) => format!("end_{}", role.name()),
+        None => format!("end_{}", c.face_id),
+    };
+    CapFacts { face_id: c.face_id, name, centroid: c.centroid, normal: c.plane.outward, area_mm2: c.area_mm2 }
+}
+
+pub(crate) fn patches(p: &surface::Patches) -> Patches<'_> {
+    Patches { patch_id: &p.patch_id, u: &p.u, v: &p.v }
+}
+
+pub(crate) fn stage(t: &StageTime) -> artefact::write::StageTime {
+    artefact::write::StageTime {
+        stage: t.name.to_owned(),
+        wall_s: t.wall_s,
+        cpu_s: Some(t.cpu_s),
+        peak_bytes: Some(t.peak_bytes),
+    }
+}
+
+/// The time now as RFC 3339, UTC, to the second.
+pub(crate) fn now_utc() -> String {
+    let seconds = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    let (days, rest) = (seconds / 86_400, seconds % 86_400);
+    // civil date from days since 1970-01-01 (Hinnant 2013, chrono-compatible low-level date algorithms)
+    let z = days + 719_468;
+    let (era, day_of_era) = (z / 146_097, z % 146_097);
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * shifted + 2) / 5 + 1;
+    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
+    let year = era * 400 + year_of_era + u64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", rest / 3600, rest / 60 % 60, rest % 60)
+}

@@ -1,0 +1,287 @@
+//! From a scan to all artefacts.
+
+use crate::facts;
+use crate::step::{Steps, cpu_seconds, peak_memory_bytes};
+use crate::{Failure, Observer, folder};
+use artefact::plan::Plan;
+use artefact::read::{InputReport, Limits};
+use artefact::write::{self, NamedBytes, Provenance};
+use artefact::{Reconstruction, reconstruction::SurfaceData};
+use exec::Ctx;
+use imaging::{Contours, Stack};
+use implicit::{Field, Sampled, Smoothing, Variational};
+use morphometry::Morphometry;
+use serde_json::{Value, json};
+use skeleton::{CapHint, MedialGraph};
+use space::{FaultKind, P3, Warning};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use surface::{Displacement, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh};
+
+/// The surface with all that is known of it.
+pub(crate) struct Wall {
+    pub(crate) mesh: TriMesh,
+    pub(crate) caps: Vec<surface::Cap>,
+    pub(crate) topology: Topology,
+    pub(crate) quality: Quality,
+    pub(crate) displacement: Displacement,
+    pub(crate) patches: surface::Patches,
+}
+
+/// The whole reconstruction: reads `inputs`, writes every artefact into the folder `out`, which appears whole or not at
+/// all. Gives back result.json.
+///
+/// # Errors
+/// [`Failure`] of any stage; nothing is left behind.
+pub fn run(inputs: &[PathBuf], plan: &Plan, out: &Path, ctx: &Ctx, observer: Observer<'_>) -> Result<Value, Failure> {
+    folder::refuse_foreign(out)?;
+    let (files, result) = reconstruct(inputs, plan, ctx, observer)?;
+    folder::publish(out, &files)?;
+    observer(&crate::Event { stage: "done", progress: 1.0, eta_s: Some(0.0) });
+    Ok(result)
+}
+
+/// Section 3 of the paper.
+fn reconstruct(
+    inputs: &[PathBuf],
+    plan: &Plan,
+    ctx: &Ctx,
+    observer: Observer<'_>,
+) -> Result<(Vec<NamedBytes>, Value), Failure> {
+    let started = (Instant::now(), facts::now_utc());
+    refuse_unmade(plan)?;
+    let mut steps = Steps::new(ctx, observer);
+
+    let (stack, input) = steps.step("read", |_| artefact::read::stack(inputs, plan, &Limits::default()))?;
+    let (contours, segmentation) = steps.step("contours", |ctx| imaging::contours(&stack, &plan.imaging(), ctx))?;
+    let (f, fit) = steps.step("fit", |ctx| implicit::fit(&contours, &implicit::Settings::default(), ctx))?;
+    let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
+    let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
+    let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
+    let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
+    let morphometry = steps.step("measure", |ctx| {
+        morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx)
+    })?;
+
+    let warnings: Vec<Warning> =
+        [input.warnings.clone(), segmentation.warnings.clone(), medial.warnings].into_iter().flatten().collect();
+    let mut files = steps.step("write", |_| {
+        write::write_all(&Reconstruction {
+            input: facts::input(&input),
+            segmentation: facts::segmentation(&contours, &segmentation),
+            contours: &contours,
+            implicit: facts::implicit(&fit),
+            surface: surface_data(&wall, &graph, &morphometry),
+            graph: &graph,
+            morphometry: &morphometry,
+            warnings: &warnings,
+            pictures: write::slice_pictures(&stack, &contours)?,
+        })
+    })?;
+    let result = files
+        .first()
+        .and_then(|f| serde_json::from_slice(&f.bytes).ok())
+        .ok_or_else(|| Failure::internal("result.json cannot be read back"))?;
+    let provenance = Provenance {
+        version: env!("CARGO_PKG_VERSION").into(),
+        host_os: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+        threads: ctx.threads(),
+        started_at: started.1,
+        finished_at: Some(facts::now_utc()),
+        wall_s: started.0.elapsed().as_secs_f64(),
+        cpu_s: Some(cpu_seconds()),
+        input_digest: input.digest,
+        plan: plan.clone(),
+        stages: steps.times.iter().map(facts::stage).collect(),
+        peak_memory_bytes: Some(peak_memory_bytes()),
+    };
+    files.push(write::provenance(&provenance, &files).map_err(|e| Failure::of(&e))?);
+    Ok((files, result))
+}
+
+/// What this version cannot make is refused, not left out in silence.
+fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
+    if !plan.outputs.iter().any(|o| o == "volume") {
+        return Ok(());
+    }
+    let message = "this version makes no volume mesh: leave `volume` out of the plan's outputs".to_owned();
+    let mut failure = Failure::new(FaultKind::Input, "plan.unsupported", message);
+    failure.place = space::Place::field("outputs");
+    Err(failure)
+}
+
+/// The zero level of f as it was fitted, polygonised at one pixel; its vertices tell where the wall is.
+fn raw_surface(f: &Variational, contours: &Contours, ctx: &Ctx) -> Result<TriMesh, surface::Error> {
+    let settings = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
+    let (mut mesh, _) = surface::polygonise(f, f.wall(), &settings, ctx)?;
+    surface::project(&mut mesh, f, contours.pixel_mm, ctx)?;
+    Ok(mesh)
+}
+
+/// f as a 3D image, and the same image smoothed within the plan's bound.
+fn smoothed(
+    f: &Variational,
+    raw: &TriMesh,
+    contours: &Contours,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<(Sampled, Image), implicit::Error> {
+    let smoothing = Smoothing {
+        max_displacement_px: plan.smoothing.max_displacement_px,
+        ..Smoothing::new(contours.pixel_mm)
+    };
+    let sampled = Sampled::new(f, &raw.vertices, &smoothing.sampling(), &ctx.part(0.0, 0.6))?;
+    let kept = within(contours, &raw.vertices);
+    let image = Image { smoothing, wall: kept, sampled: sampled.clone() };
+    Ok((sampled, image))
+}
+
+/// What is needed to smooth again with a smaller sigma.
+struct Image {
+    smoothing: Smoothing,
+    wall: Vec<P3>,
+    sampled: Sampled,
+}
+
+/// Wall points on the inner side of every cut plane: only there is the wall known.
+fn within(contours: &Contours, points: &[P3]) -> Vec<P3> {
+    let inside = |p: &&P3| contours.cuts.iter().all(|c| (**p - c.point).dot(c.outward) <= 0.0);
+    points.iter().filter(inside).copied().collect()
+}
+
+/// Attempts at a sigma whose wall keeps the bound on the finished mesh, which has vertices where the bisection had none.
+const ATTEMPTS: usize = 6;
+/// Factor on sigma between attempts.
+const RETREAT: f64 = 0.75;
+
+/// The finished wall: smoothed, cut at the data's ends, capped, remeshed, measured.
+fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+    let mut limit = if image.smoothing.max_displacement_px > 0.0 { f64::INFINITY } else { 0.0 };
+    for _ in 0..ATTEMPTS {
+        let (field, report) = if limit > 0.0 {
+            implicit::smooth(&image.sampled, &image.wall, &image.smoothing, limit, &ctx.part(0.0, 0.3))?
+        } else {
+            break;
+        };
+        let wall = mesh_of(&field, f, contours, plan, &ctx.part(0.3, 1.0))?;
+        let moved = wall.displacement.min_px.abs().max(wall.displacement.max_px.abs());
+        if moved <= image.smoothing.max_displacement_px {
+            return Ok(wall);
+        }
+        limit = report.sigma_mm * RETREAT;
+    }
+    mesh_of(&image.sampled, f, contours, plan, ctx)
+}
+
+fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+    let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
+    let (rough, _) = surface::polygonise(field, f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+    let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
+    let settings = RemeshSettings {
+        edge_mm: plan.surface.edge_mm,
+        max_error_mm: plan.surface.max_error_mm,
+        sizing: Sizing::Curvature,
+        ..RemeshSettings::default()
+    };
+    let (mesh, _) = surface::remesh(&cut, field, &contours.cuts, &settings, &ctx.part(0.2, 0.8))?;
+    let topology = surface::check(&mesh).map_err(surface::Error::from)?;
+    let quality = surface::quality(&mesh, field, ctx)?;
+    let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
+    let patches = surface::patches(&mesh, ctx)?;
+    Ok(Wall { mesh, caps: report.caps, topology, quality, displacement, patches })
+}
+
+/// The wall's stage calls two crates.
+#[derive(Debug, thiserror::Error)]
+enum MeshFault {
+    #[error(transparent)]
+    Surface(#[from] surface::Error),
+    #[error(transparent)]
+    Implicit(#[from] implicit::Error),
+}
+
+impl space::Faulty for MeshFault {
+    fn kind(&self) -> FaultKind {
+        match self {
+            Self::Surface(e) => e.kind(),
+            Self::Implicit(e) => e.kind(),
+        }
+    }
+    fn code(&self) -> &'static str {
+        match self {
+            Self::Surface(e) => e.code(),
+            Self::Implicit(e) => e.code(),
+        }
+    }
+    fn place(&self) -> space::Place {
+        match self {
+            Self::Surface(e) => e.place(),
+            Self::Implicit(e) => e.place(),
+        }
+    }
+}
+
+/// Medial lines of the unsmoothed image of f: the numbers come from the data, not from the smoothed wall.
+fn medial_lines(
+    sampled: &Sampled,
+    f: &Variational,
+    contours: &Contours,
+    wall: &Wall,
+    ctx: &Ctx,
+) -> Result<(MedialGraph, skeleton::Report), skeleton::Error> {
+    let caps: Vec<CapHint> = wall
+        .caps
+        .iter()
+        .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
+        .collect();
+    let seeds = within(contours, f.inner());
+    skeleton::medial_graph(sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), ctx)
+}
+
+fn surface_data<'a>(wall: &'a Wall, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceData<'a> {
+    SurfaceData {
+        mesh: &wall.mesh,
+        quality: facts::surface(wall, graph, morphometry),
+        displacement_mm: &wall.displacement.mm,
+        displacement_px: &wall.displacement.px,
+        patches: Some(facts::patches(&wall.patches)),
+    }
+}
+
+/// What is understood of a scan and a plan, without a reconstruction: slices, spacing, orientation, lumens found.
+///
+/// # Errors
+/// [`Failure`] of reading or of the segmentation.
+pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Value, Failure> {
+    refuse_unmade(plan)?;
+    let fault = |e: &dyn space::Faulty| Failure::of(e);
+    let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| fault(&e))?;
+    let (contours, report) = imaging::contours(&stack, &plan.imaging(), ctx).map_err(|e| fault(&e))?;
+    Ok(understood(&stack, &input, &contours, &report))
+}
+
+fn understood(stack: &Stack, input: &InputReport, contours: &Contours, report: &imaging::Report) -> Value {
+    let facts = facts::segmentation(contours, report);
+    let warnings: Vec<Value> = input
+        .warnings
+        .iter()
+        .chain(&report.warnings)
+        .map(|w| json!({"code": w.code, "message": w.message, "where": artefact::problem::Where::of(&w.place)}))
+        .collect();
+    let corner = |k: usize| stack.position(k, 0.0, 0.0).to_array();
+    json!({
+        "input": {
+            "format": input.format.name(), "slices": input.slices, "rows": stack.rows, "columns": stack.columns,
+            "missing_slices": input.missing_slices, "spacing_mm": input.spacing_mm, "digest": input.digest,
+            "first_pixel_mm": corner(0), "last_slice_first_pixel_mm": corner(stack.slices().saturating_sub(1)),
+            "row_direction": stack.row_direction.to_array(), "column_direction": stack.column_direction.to_array(),
+            "thickness_mm": stack.thickness_mm,
+        },
+        "segmentation": {
+            "axis": facts.axis, "threshold": facts.threshold, "psf_sigma_px": facts.psf_sigma_px,
+            "contours": facts.contours,
+            "lumens": facts.lumens.iter().map(|[s, n]| json!({"slice": s, "count": n})).collect::<Vec<_>>(),
+        },
+        "warnings": warnings,
+    })
+}
