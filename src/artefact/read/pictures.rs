@@ -153,7 +153,7 @@ fn picture(file: &NamedBytes, limits: &Limits) -> Result<Page, Error> {
 /// Grey values; `None` when the channels differ or something is transparent.
 fn grey(image: DynamicImage) -> Option<Vec<f32>> {
     fn equal<T: Copy + PartialEq + Into<f32>>(samples: &[T], channels: usize, opaque: T) -> Option<Vec<f32>> {
-        let colours = channels - usize::from(channels % 2 == 0);
+        let colours = channels - usize::from(channels.is_multiple_of(2));
         let value = |p: &[T]| {
             let same = p[..colours].iter().all(|c| *c == p[0]) && p[colours..].iter().all(|a| *a == opaque);
             same.then(|| p[0].into())

@@ -202,7 +202,7 @@ fn bad_input_is_refused_by_code_and_place() {
 fn a_tilted_gantry_is_refused() {
     let mut s = oblique();
     for (k, o) in s.origins.iter_mut().enumerate() {
-        *o = *o + s.column_direction * (0.3 * k as f64);
+        *o += s.column_direction * (0.3 * k as f64);
     }
     let files =
         write::dicom::slices(&s, &Meta { seed: 1, description: String::new(), numbering: Numbering::Ascending });

@@ -159,7 +159,7 @@ fn identity(meta: &Meta, uid: &dyn Fn(&str) -> String, instance: &str) -> Vec<El
 fn geometry(stack: &Stack, k: usize) -> Vec<Element> {
     let [u, v] = [stack.row_direction, stack.column_direction].map(V3::to_array);
     let position: P3 = stack.origins[k];
-    let thickness = stack.thickness_mm.map(|t| decimal(t)).unwrap_or_default();
+    let thickness = stack.thickness_mm.map(decimal).unwrap_or_default();
     vec![
         text(0x0018_0050, b"DS", thickness),
         text(0x0020_0032, b"DS", decimals(&position.to_array())),
@@ -172,7 +172,7 @@ fn number(numbering: Numbering, k: usize, slices: usize) -> usize {
     match numbering {
         Numbering::Ascending => k + 1,
         Numbering::Descending => slices - k,
-        Numbering::Interleaved if k % 2 == 0 => slices / 2 + k / 2 + 1,
+        Numbering::Interleaved if k.is_multiple_of(2) => slices / 2 + k / 2 + 1,
         Numbering::Interleaved => k / 2 + 1,
     }
 }
