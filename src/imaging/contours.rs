@@ -1,0 +1,283 @@
+//! The whole of imaging: segment, choose the axis, draw, smooth, correct, find the ends.
+
+use crate::draw::{Drawn, Frame, Outline, axis, drawn, planes};
+use crate::march::Line;
+use crate::segment::{Segmentation, Vessel, segment};
+use crate::smooth::{Profile, Smoothed, blur, corrected, smoothed};
+use crate::spline::PeriodicSpline;
+use crate::track::ends;
+use crate::volume::median;
+use crate::{Axis, Contours, Curve, Error, Plane, Settings, Stack};
+use exec::Ctx;
+use space::{Place, Warning};
+
+/// What imaging found on its way.
+#[derive(Clone, Debug)]
+pub struct Report {
+    /// Grey level of the wall: the plan's, or the median of the local levels over the lumen.
+    pub threshold: f64,
+    /// Point spread (Gaussian sigma, px) that was given or estimated; `None` when neither was possible.
+    pub psf_sigma_px: Option<f64>,
+    /// Number of contours.
+    pub contours: usize,
+    /// (plane index, number of lumens) of every plane that shows one.
+    pub lumens: Vec<(usize, usize)>,
+    /// Axis across which the contours were drawn.
+    pub axis: Axis,
+    /// The vessel taken, then its runners-up.
+    pub candidates: Vec<Vessel>,
+    /// Noise of the raw grey values, standard deviation.
+    pub noise: f64,
+    /// Lines dropped as specks of noise.
+    pub specks: usize,
+    /// What the reader must know.
+    pub warnings: Vec<Warning>,
+}
+
+/// The smooth contours of the vessel tree in a stack.
+///
+/// Segmentation ([`segment`]), contour axis, marching squares on raw grey value minus local level, periodic smoothing
+/// splines, half-maximum correction by the point spread, tips and cut planes. The stack must be [`Stack::validated`].
+/// Curves are in plane order, numbered within their plane. The outcome has the same bits for any number of threads.
+/// Cost: about 10 passes over the stack; memory about 4 copies of it.
+///
+/// # Errors
+/// Those of [`segment`], [`Error::TooFewSlices`], [`Error::NoSuchSlice`], [`Error::TooFewContours`],
+/// [`Error::Cancelled`].
+pub fn contours(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Report), Error> {
+    ctx.check()?;
+    let last = stack.slices() - 1;
+    if let Some(&slice) = settings.exclude_slices.iter().find(|&&k| k > last) {
+        return Err(Error::NoSuchSlice { field: "segmentation.exclude_slices", slice, last });
+    }
+    if settings.exclude_slices.is_empty() {
+        return found(stack, settings, ctx);
+    }
+    let kept = stack.without(&settings.exclude_slices);
+    if kept.slices() < 3 {
+        return Err(Error::TooFewSlices { slices: kept.slices() });
+    }
+    // the region names a slice of the whole stack
+    let region = settings.region.map(|mut r| {
+        r.slice -= (0..r.slice).filter(|k| settings.exclude_slices.contains(k)).count();
+        r
+    });
+    found(&kept, &Settings { region, exclude_slices: Vec::new(), ..settings.clone() }, ctx)
+}
+
+fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Report), Error> {
+    let s = segment(stack, settings, &ctx.part(0.0, 0.7))?;
+    let axis = settings.axis.unwrap_or_else(|| axis(stack, &s));
+    let planes = planes(stack, axis);
+    let drawn = drawn(stack, &s, axis, ctx)?;
+    ctx.progress(0.8);
+    let shown = drawn.iter().filter(|d| !d.outlines.is_empty()).count();
+    if shown < 3 {
+        return Err(Error::TooFewContours { planes: shown });
+    }
+    let outlines: Vec<(usize, usize)> =
+        drawn.iter().enumerate().flat_map(|(k, d)| (0..d.outlines.len()).map(move |o| (k, o))).collect();
+    let smooth = ctx.map(&outlines, |&(k, o)| smoothed(&drawn[k].outlines[o].line))?;
+    ctx.progress(0.9);
+    let mut warnings = stack.gap_warnings();
+    warnings.extend(s.warnings.iter().cloned());
+    let sigma_mm = match settings.psf_sigma_px {
+        Some(px) => Some(px * stack.pixel_mm()),
+        None => psf(stack, &s, axis, &drawn, &outlines, &smooth, &planes, ctx)?,
+    };
+    if sigma_mm.is_none() {
+        let message = "the point spread could not be estimated: contours are not corrected for it, and convex lumens \
+                       come out too small by kappa/2 (sigma^2 + px^2/12)";
+        warnings.push(Warning::new("contours.psf_unknown", message, Place::none()));
+    }
+    let variance = sigma_mm.map(|sigma| variance(stack, axis, sigma));
+    let curves = ctx.map_range(outlines.len(), |i| {
+        let (k, o) = outlines[i];
+        curve(&drawn[k].outlines[o], &smooth[i], o, variance, stack)
+    })?;
+    let ends = ends(stack, &s, axis, &drawn, &planes);
+    warnings.extend(ends.warnings);
+    let report = Report {
+        threshold: s.threshold,
+        psf_sigma_px: sigma_mm.map(|m| m / stack.pixel_mm()),
+        contours: curves.len(),
+        lumens: lumens(&drawn),
+        axis,
+        candidates: s.candidates,
+        noise: s.noise,
+        specks: drawn.iter().map(|d| d.specks).sum(),
+        warnings,
+    };
+    let (pixel_mm, thickness_mm) = (stack.pixel_mm(), stack.thickness_mm);
+    let contours = Contours { axis, planes, curves, cuts: ends.cuts, tips: ends.tips, pixel_mm, thickness_mm };
+    ctx.progress(1.0);
+    Ok((contours, report))
+}
+
+fn lumens(drawn: &[Drawn]) -> Vec<(usize, usize)> {
+    let count = |d: &Drawn| {
+        let first = d.outlines.first()?;
+        Some((first.plane, d.outlines.iter().filter(|o| !o.hole).count()))
+    };
+    drawn.iter().filter_map(count).collect()
+}
+
+/// Blur variances along the plane's u and v, mm2: point spread and pixel within the slices; across them the thickness,
+/// or the step where no thickness is known.
+fn variance(stack: &Stack, axis: Axis, sigma_mm: f64) -> [f64; 2] {
+    let pixel = sigma_mm.powi(2) + stack.pixel_mm().powi(2) / 12.0;
+    let across = stack.thickness_mm.unwrap_or(stack.slice_spacing_mm()).powi(2) / 12.0;
+    match axis {
+        Axis::Slice => [pixel, pixel],
+        Axis::Row => [across, pixel],
+        Axis::Column => [pixel, across],
+    }
+}
+
+fn curve(outline: &Outline, fit: &Smoothed, lumen: usize, variance: Option<[f64; 2]>, stack: &Stack) -> Curve {
+    let spline = match variance {
+        Some(v) => corrected(&fit.spline, v),
+        None => fit.spline.clone(),
+    };
+    let border = border(&outline.line, &spline, BORDER_MARGIN_PX * stack.pixel_mm());
+    Curve {
+        plane: outline.plane,
+        lumen,
+        spline,
+        raw: outline.line.points.clone(),
+        level: outline.level,
+        standard_error_mm: fit.standard_error,
+        border,
+        hole: outline.hole,
+    }
+}
+
+/// The spline rounds the corner where wall and border meet: that much of the wall counts as border.
+const BORDER_MARGIN_PX: f64 = 1.5;
+
+/// Runs of border points as intervals of arc length, widened by a margin.
+fn border(line: &Line, spline: &PeriodicSpline, margin: f64) -> Vec<[f64; 2]> {
+    let n = line.points.len();
+    let length = spline.length();
+    if !line.border.contains(&true) {
+        return Vec::new();
+    }
+    if !line.border.contains(&false) {
+        return vec![[0.0, length]];
+    }
+    let foot = |p: [f64; 2]| {
+        let m = 8 * spline.knots();
+        let at = |i: usize| spline.derivatives(length * i as f64 / m as f64)[0];
+        let off = |i: usize| (at(i)[0] - p[0]).hypot(at(i)[1] - p[1]);
+        let best = (0..m).min_by(|&a, &b| off(a).total_cmp(&off(b))).unwrap_or(0);
+        length * best as f64 / m as f64
+    };
+    let starts = (0..n).filter(|&i| line.border[i] && !line.border[(i + n - 1) % n]);
+    starts
+        .map(|i| {
+            let run = (0..n).take_while(|k| line.border[(i + k) % n]).count();
+            let [a, b] = [foot(line.points[i]), foot(line.points[(i + run - 1) % n])];
+            if (b - a).rem_euclid(length) + 2.0 * margin >= length {
+                return [0.0, length];
+            }
+            [(a - margin).rem_euclid(length), (b + margin).rem_euclid(length)]
+        })
+        .collect()
+}
+
+/// Half-width of the band of pixels that enter an edge profile, px.
+const PROFILE_PX: f64 = 3.0;
+/// Profiles see the wall at a right angle only where the vessel is upright: the lower quartile over curves and
+/// directions is taken, which oblique walls in thick slices (blurred up to three times wider) do not reach.
+const UPRIGHT_QUANTILE: f64 = 0.25;
+/// Curves shorter than this many px have no straight wall to take a profile from.
+const LEAST_LENGTH_PX: f64 = 15.0;
+/// Fewest profiles for an estimate.
+const LEAST_PROFILES: usize = 8;
+
+/// The point spread from edge profiles, mm: pixels within 3 px of a curve by signed distance, heights by the local
+/// levels, least squares of the normal distribution per curve and direction (normal nearer to u or to v). `None` when
+/// fewer than 8 profiles are usable. Across slices nothing is estimated.
+#[allow(clippy::too_many_arguments)]
+fn psf(
+    stack: &Stack,
+    s: &Segmentation,
+    axis: Axis,
+    drawn: &[Drawn],
+    outlines: &[(usize, usize)],
+    smooth: &[Smoothed],
+    planes: &[Plane],
+    ctx: &Ctx,
+) -> Result<Option<f64>, Error> {
+    let px = stack.pixel_mm();
+    let found = ctx.map_range(outlines.len(), |i| {
+        let (k, o) = outlines[i];
+        let outline = &drawn[k].outlines[o];
+        let straight = outline.line.border.iter().all(|b| !b);
+        if !straight || smooth[i].spline.length() < LEAST_LENGTH_PX * px {
+            return Vec::new();
+        }
+        let profiles = profiles(stack, s, Frame::new(axis), k, &planes[outline.plane], &smooth[i].spline);
+        let in_plane = |d: &usize| match axis {
+            Axis::Slice => true,
+            Axis::Row => *d == 1,
+            Axis::Column => *d == 0,
+        };
+        (0..2).filter(in_plane).filter_map(|d| blur(&profiles[d], 0.1 * px, 3.0 * px)).collect()
+    })?;
+    let mut widths: Vec<f64> = found.into_iter().flatten().collect();
+    if widths.len() < LEAST_PROFILES {
+        return Ok(None);
+    }
+    let upright = crate::volume::quantile(&mut widths, UPRIGHT_QUANTILE);
+    // the curves' own error blurs the profile as well
+    let mut errors: Vec<f64> = smooth.iter().map(|f| f.standard_error).collect();
+    let own = median(&mut errors).powi(2);
+    Ok(Some((upright.powi(2) - own - px * px / 12.0).max(0.0).sqrt()))
+}
+
+/// Profiles of one curve, for normals nearer to u and nearer to v.
+fn profiles(
+    stack: &Stack,
+    s: &Segmentation,
+    frame: Frame,
+    k: usize,
+    plane: &Plane,
+    spline: &PeriodicSpline,
+) -> [Profile; 2] {
+    let px = stack.pixel_mm();
+    let count = (spline.length() / (0.5 * px)).ceil() as usize;
+    let samples: Vec<[[f64; 2]; 3]> =
+        (0..count).map(|i| spline.derivatives(spline.length() * i as f64 / count as f64)).collect();
+    let mut out = [Vec::new(), Vec::new()];
+    let [w, h, _] = frame.size(s);
+    let [u0, v0, _] = frame.of.map(|a| s.low[a]);
+    let reach = PROFILE_PX * px;
+    let low = [0, 1].map(|a| samples.iter().map(|p| p[0][a]).fold(f64::MAX, f64::min) - reach);
+    let high = [0, 1].map(|a| samples.iter().map(|p| p[0][a]).fold(f64::MIN, f64::max) + reach);
+    for j in (0..h).filter(|j| (low[1]..high[1]).contains(&plane.v_mm[v0 + j])) {
+        for i in (0..w).filter(|i| (low[0]..high[0]).contains(&plane.u_mm[u0 + i])) {
+            let p = [plane.u_mm[u0 + i], plane.v_mm[v0 + j]];
+            let off = |q: &[[f64; 2]; 3]| (q[0][0] - p[0]).hypot(q[0][1] - p[1]);
+            let Some(near) = samples.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
+            if off(near) > reach {
+                continue;
+            }
+            let [q, d, dd] = *near;
+            let speed = d[0].hypot(d[1]).max(f64::MIN_POSITIVE);
+            let inward = [-d[1] / speed, d[0] / speed];
+            // the sample is up to a quarter of a pixel off the foot: the tangential part is taken out by curvature
+            let rel = [p[0] - q[0], p[1] - q[1]];
+            let along = (rel[0] * d[0] + rel[1] * d[1]) / speed;
+            let kappa = (d[0] * dd[1] - d[1] * dd[0]) / speed.powi(3);
+            let distance = rel[0] * inward[0] + rel[1] * inward[1] - 0.5 * kappa * along * along;
+            let at = frame.index(s, i, j, k);
+            let contrast = f64::from(s.contrast[at]).max(f64::MIN_POSITIVE);
+            let height = 0.5 + f64::from(Frame::grey(s, stack, at) - s.level[at]) / contrast;
+            if s.site[at] != crate::segment::Site::Far {
+                out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
+            }
+        }
+    }
+    out
+}
