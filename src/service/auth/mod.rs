@@ -1,0 +1,215 @@
+//! Who calls: API keys, and what a role may do.
+//!
+//! A key is `vsk_` and 256 random bits in hexadecimal; only its SHA-256 is stored (nothing of low entropy, so no slow
+//! hash). It comes as `Authorization: Bearer` or, for the portal's own page, as an HttpOnly SameSite=Strict cookie
+//! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
+
+use crate::config::Auth;
+use crate::db::{Db, now};
+use crate::error::Problem;
+use crate::state::State;
+use crate::store::hex;
+use axum::extract::FromRequestParts;
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, StatusCode, header};
+use sha2::{Digest as _, Sha256};
+use uuid::Uuid;
+
+/// Begins every API key.
+pub const KEY_PREFIX: &str = "vsk_";
+/// The portal's cookie.
+pub const COOKIE: &str = "vasculum_key";
+/// The tenant of a service that knows only one.
+pub const DEFAULT_TENANT: &str = "default";
+
+/// What a key may do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, sqlx::Type)]
+#[sqlx(rename_all = "lowercase")]
+pub enum Role {
+    /// Send scans and read one's results.
+    Upload,
+    /// Read only.
+    Read,
+    /// Everything.
+    Admin,
+    /// Read the audit only.
+    Auditor,
+}
+
+/// What a call wants.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Action {
+    /// See jobs and results.
+    Read,
+    /// Create, cancel, retry or erase jobs.
+    Change,
+}
+
+impl Role {
+    /// Whether this role may do that.
+    pub fn may(self, action: Action) -> bool {
+        match action {
+            Action::Read => self != Self::Auditor,
+            Action::Change => matches!(self, Self::Upload | Self::Admin),
+        }
+    }
+}
+
+/// The caller, as an extractor: a handler that takes it cannot be reached without one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Principal {
+    /// Whose jobs are seen.
+    pub tenant: String,
+    /// What may be done.
+    pub role: Role,
+}
+
+/// A new random key.
+///
+/// # Errors
+/// The operating system has no random bytes.
+pub fn new_key() -> Result<String, getrandom::Error> {
+    let mut bytes = [0_u8; 32];
+    getrandom::fill(&mut bytes)?;
+    Ok(format!("{KEY_PREFIX}{}", hex(&bytes)))
+}
+
+/// Makes the first admin key and returns it, or `None` when there is a key already.
+///
+/// # Errors
+/// The database's; no random bytes.
+pub async fn first_key(db: &Db) -> anyhow::Result<Option<String>> {
+    let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
+    let made = sqlx::query(concat!(
+        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) SELECT $1, $2, 'admin', 'first start', $3, ",
+        now!(),
+        " WHERE NOT EXISTS (SELECT 1 FROM api_key WHERE revoked_at IS NULL)"
+    ))
+    .bind(Uuid::now_v7().to_string())
+    .bind(DEFAULT_TENANT)
+    .bind(digest(&key))
+    .execute(&db.writer)
+    .await?
+    .rows_affected();
+    Ok((made > 0).then_some(key))
+}
+
+fn digest(key: &str) -> Vec<u8> {
+    Sha256::digest(key.as_bytes()).to_vec()
+}
+
+/// The principal of a key, or a 401.
+///
+/// # Errors
+/// `auth.key` when the key is unknown or revoked; the database's.
+pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
+    let row: Option<(String, Role)> =
+        sqlx::query_as("SELECT tenant, role FROM api_key WHERE digest = $1 AND revoked_at IS NULL")
+            .bind(digest(key))
+            .fetch_optional(&db.reader)
+            .await?;
+    match row {
+        Some((tenant, role)) => Ok(Principal { tenant, role }),
+        None => Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one.")),
+    }
+}
+
+fn unauthorized(code: &str, detail: &str) -> Problem {
+    Problem::new(StatusCode::UNAUTHORIZED, code, detail).with_header("www-authenticate", "Bearer realm=\"vasculum\"")
+}
+
+/// The key of a request's headers.
+enum Sent<'a> {
+    Bearer(&'a str),
+    Cookie(&'a str),
+}
+
+fn sent(headers: &HeaderMap) -> Option<Sent<'_>> {
+    if let Some(value) = headers.get(header::AUTHORIZATION) {
+        let (scheme, key) = value.to_str().ok()?.split_once(' ')?;
+        return scheme.eq_ignore_ascii_case("bearer").then(|| Sent::Bearer(key.trim()));
+    }
+    headers
+        .get_all(header::COOKIE)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(';'))
+        .find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
+        .map(Sent::Cookie)
+}
+
+/// A page of another origin may make the browser send our cookie in spite of SameSite (an old browser): refuse it.
+fn same_origin(headers: &HeaderMap) -> bool {
+    let text = |name| headers.get(name).and_then(|v: &axum::http::HeaderValue| v.to_str().ok());
+    match (text(header::ORIGIN), text(header::HOST)) {
+        (None, _) => true,
+        (Some(origin), Some(host)) => origin.split_once("://").is_some_and(|(_, from)| from == host),
+        (Some(_), None) => false,
+    }
+}
+
+impl FromRequestParts<State> for Principal {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &State) -> Result<Self, Problem> {
+        let action = if parts.method.is_safe() { Action::Read } else { Action::Change };
+        let principal = match state.config.auth {
+            Auth::None => Self { tenant: DEFAULT_TENANT.to_owned(), role: Role::Admin },
+            Auth::Required => match sent(&parts.headers) {
+                None => {
+                    return Err(unauthorized(
+                        "auth.missing",
+                        "This call needs an API key: send the header Authorization: Bearer vsk_...",
+                    ));
+                }
+                Some(Sent::Cookie(_)) if action == Action::Change && !same_origin(&parts.headers) => {
+                    return Err(Problem::new(
+                        StatusCode::FORBIDDEN,
+                        "auth.origin",
+                        "A page of another origin may not change anything here by cookie.",
+                    ));
+                }
+                Some(Sent::Bearer(key) | Sent::Cookie(key)) => principal(state.queue.db(), key).await?,
+            },
+        };
+        if principal.role.may(action) {
+            Ok(principal)
+        } else {
+            Err(Problem::new(StatusCode::FORBIDDEN, "auth.role", "This API key may not do that. Ask the operator."))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_long_and_differ() {
+        let (a, b) = (new_key().unwrap(), new_key().unwrap());
+        assert_ne!(a, b);
+        assert_eq!(a.len(), KEY_PREFIX.len() + 64);
+    }
+
+    #[test]
+    fn a_bearer_goes_before_a_cookie() {
+        let mut headers = HeaderMap::new();
+        headers.insert(header::COOKIE, "a=b; vasculum_key=vsk_c".parse().unwrap());
+        assert!(matches!(sent(&headers), Some(Sent::Cookie("vsk_c"))));
+        headers.insert(header::AUTHORIZATION, "bearer vsk_b".parse().unwrap());
+        assert!(matches!(sent(&headers), Some(Sent::Bearer("vsk_b"))));
+        headers.insert(header::AUTHORIZATION, "Basic dXNlcg==".parse().unwrap());
+        assert!(sent(&headers).is_none());
+    }
+
+    #[test]
+    fn another_origin_is_seen() {
+        let mut headers = HeaderMap::new();
+        headers.insert(header::HOST, "127.0.0.1:8080".parse().unwrap());
+        assert!(same_origin(&headers));
+        headers.insert(header::ORIGIN, "http://127.0.0.1:8080".parse().unwrap());
+        assert!(same_origin(&headers));
+        headers.insert(header::ORIGIN, "http://evil.example".parse().unwrap());
+        assert!(!same_origin(&headers));
+    }
+}

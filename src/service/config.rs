@@ -1,0 +1,116 @@
+//! What an operator may set. The binary parses the command line and the environment into [`Config`]; nothing below
+//! reads either.
+
+use crate::error::Problem;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// A file of an upload: its name inside the upload and its bytes.
+pub type NamedBytes = (String, Vec<u8>);
+
+/// Reads an upload before anything touches disk: unpacks archives within limits, de-identifies DICOM, refuses what
+/// cannot be read. Runs on a blocking thread.
+pub type Intake = fn(Vec<NamedBytes>) -> Result<Vec<NamedBytes>, Problem>;
+
+/// Checks the bytes of a plan; every fault at once.
+pub type CheckPlan = fn(&[u8]) -> Result<(), Problem>;
+
+/// Who may call.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Auth {
+    /// Every call under `/v1` needs an API key. The first start makes an admin key and prints it once.
+    Required,
+    /// No keys. Only on a loopback address, and only for a Host header that names it (DNS rebinding).
+    None,
+}
+
+/// Settings of the service. `Default` gives one machine: SQLite and a local folder, loopback, keys required.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// Database, artefact folder, working folders and locks live here. Made if missing. Default `./vasculum-data`.
+    pub data_dir: PathBuf,
+    /// Address to listen on; port 0 takes a free one, printed and written to `<data_dir>/listen`.
+    /// Default 127.0.0.1:8080.
+    pub listen: SocketAddr,
+    /// `sqlite:PATH`; default `<data_dir>/vasculum.sqlite`. Other databases are refused at start.
+    pub database_url: Option<String>,
+    /// `file:PATH` of the artefact folder; default `<data_dir>/store`. Other stores are refused at start.
+    pub store_url: Option<String>,
+    /// Jobs that run at the same time, each in its own process. 0: this process only serves. Default 1.
+    pub workers: usize,
+    /// `--threads` of each job's process; 0 lets the process take all cores. Default 0.
+    pub threads: usize,
+    /// Who may call. Default [`Auth::Required`].
+    pub auth: Auth,
+    /// The program whose `exec-job` sub-command runs one job. Default: this program.
+    pub executable: PathBuf,
+    /// Arguments put before `exec-job` (none by default; an interpreter's script in tests).
+    pub executable_args: Vec<String>,
+    /// Largest request body, bytes. Default 2 GiB.
+    pub max_body: u64,
+    /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
+    /// again (503). At least `max_body`. Default 4 GiB.
+    pub upload_memory: u64,
+    /// `/readyz` says no when the data folder's disk has less than this, bytes. Default 256 MiB.
+    pub min_free_disk: u64,
+    /// Reads an upload. Default: takes the files as they are; the binary wires `artefact::read::intake`.
+    pub intake: Intake,
+    /// Checks a plan. Default: any JSON object; the binary wires the artefact crate's reader.
+    pub check_plan: CheckPlan,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            data_dir: PathBuf::from("vasculum-data"),
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            database_url: None,
+            store_url: None,
+            workers: 1,
+            threads: 0,
+            auth: Auth::Required,
+            executable: std::env::current_exe().unwrap_or_else(|_| PathBuf::from("vasculum")),
+            executable_args: Vec::new(),
+            max_body: 2 << 30,
+            upload_memory: 4 << 30,
+            min_free_disk: 256 << 20,
+            intake: Ok,
+            check_plan: crate::intake::json_object,
+        }
+    }
+}
+
+impl Config {
+    /// The SQLite file.
+    ///
+    /// # Errors
+    /// A `database_url` of another scheme.
+    pub fn database_file(&self) -> anyhow::Result<PathBuf> {
+        match &self.database_url {
+            None => Ok(self.data_dir.join("vasculum.sqlite")),
+            Some(url) => path_of(url, "sqlite:").ok_or_else(|| {
+                anyhow::anyhow!("this version keeps its jobs in SQLite: --database-url must be sqlite:PATH, not {url}")
+            }),
+        }
+    }
+
+    /// The artefact folder.
+    ///
+    /// # Errors
+    /// A `store_url` of another scheme.
+    pub fn store_dir(&self) -> anyhow::Result<PathBuf> {
+        match &self.store_url {
+            None => Ok(self.data_dir.join("store")),
+            Some(url) => path_of(url, "file:").ok_or_else(|| {
+                anyhow::anyhow!("this version keeps artefacts in a folder: --store-url must be file:PATH, not {url}")
+            }),
+        }
+    }
+}
+
+/// The path of `scheme:PATH` or `scheme://PATH`.
+fn path_of(url: &str, scheme: &str) -> Option<PathBuf> {
+    let rest = url.strip_prefix(scheme)?;
+    let path = rest.strip_prefix("//").unwrap_or(rest);
+    (!path.is_empty()).then(|| PathBuf::from(path))
+}

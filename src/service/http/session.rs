@@ -1,0 +1,47 @@
+//! The portal's session: its key as a cookie that scripts cannot read, so that downloads by a link work.
+
+use crate::auth::{COOKIE, principal};
+use crate::config::Auth;
+use crate::error::Problem;
+use crate::state::State;
+use axum::Json;
+use axum::extract::State as Shared;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use serde::Deserialize;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+/// Routes of this resource.
+pub(super) fn router() -> OpenApiRouter<State> {
+    OpenApiRouter::new().routes(routes!(begin, end))
+}
+
+/// A key to keep as a cookie.
+#[derive(Deserialize, utoipa::ToSchema)]
+struct Session {
+    /// `vsk_...`
+    key: String,
+}
+
+/// Begins a session of the portal: the key becomes a cookie of this origin.
+#[utoipa::path(post, path = "/v1/session", tag = "jobs", request_body = Session, responses(
+    (status = 204, description = "The cookie is set"),
+    (status = 401, description = "The key is unknown or revoked", body = Problem, content_type = "application/problem+json")
+))]
+async fn begin(Shared(state): Shared<State>, Json(session): Json<Session>) -> Result<Response, Problem> {
+    if state.config.auth == Auth::Required {
+        principal(state.queue.db(), &session.key).await?;
+    }
+    Ok(cookie(&format!("{COOKIE}={}; Path=/; HttpOnly; SameSite=Strict", session.key)))
+}
+
+/// Ends the session.
+#[utoipa::path(delete, path = "/v1/session", tag = "jobs", responses((status = 204, description = "The cookie is gone")))]
+async fn end() -> Response {
+    cookie(&format!("{COOKIE}=; Path=/; HttpOnly; SameSite=Strict; Max-Age=0"))
+}
+
+fn cookie(text: &str) -> Response {
+    (StatusCode::NO_CONTENT, [(header::SET_COOKIE, text)]).into_response()
+}

@@ -1,0 +1,257 @@
+//! Starting and stopping: locks, database, rescue, sweep, workers, listener.
+
+use crate::auth;
+use crate::config::{Auth, Config};
+use crate::db::Db;
+use crate::http;
+use crate::queue::{JobState, Queue};
+use crate::state::{State, UPLOAD_UNIT};
+use crate::store::Store;
+use crate::telemetry;
+use crate::worker::{Heartbeat, Owner, Worker};
+use anyhow::{Context as _, bail};
+use std::fs::{File, TryLockError};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+/// How long open connections may go on after the stop.
+const FAREWELL: Duration = Duration::from_secs(3);
+
+/// A running service. Dropping it without [`Server::stop`] leaves jobs to be taken back at the next start.
+#[derive(Debug)]
+pub struct Server {
+    address: SocketAddr,
+    first_key: Option<String>,
+    shutdown: CancellationToken,
+    tasks: JoinSet<()>,
+    db: Db,
+    /// Held open for its lock.
+    _lock: File,
+}
+
+impl Server {
+    /// Opens everything, takes back what a dead process left, and listens.
+    ///
+    /// # Errors
+    /// The data folder is in use or cannot be written; the address is taken; no keys on an address beyond loopback.
+    pub async fn start(config: Config) -> anyhow::Result<Self> {
+        if config.auth == Auth::None && !config.listen.ip().is_loopback() {
+            bail!("refusing to serve {} without keys: leave out --no-auth, or listen on 127.0.0.1", config.listen);
+        }
+        let config = Arc::new(config);
+        std::fs::create_dir_all(&config.data_dir)
+            .with_context(|| format!("cannot make the data folder {}", config.data_dir.display()))?;
+        let lock = lock(&config.data_dir)?;
+        let listener = TcpListener::bind(config.listen)
+            .await
+            .with_context(|| format!("cannot listen on {}", config.listen))?;
+        let address = listener.local_addr()?;
+        let shutdown = CancellationToken::new();
+        let mut tasks = JoinSet::new();
+        let parts = Parts::open(&config).await?;
+        let first_key = match config.auth {
+            Auth::Required => auth::first_key(parts.queue.db()).await?,
+            Auth::None => None,
+        };
+        let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+        tasks.spawn(sweep(parts.queue.clone(), parts.store.clone(), Uuid::now_v7()));
+        let state = State {
+            uploads: Arc::new(Semaphore::new(upload_units(&config))),
+            config: Arc::clone(&config),
+            queue: parts.queue,
+            store: parts.store,
+            worker,
+            shutdown: shutdown.clone(),
+            metrics: telemetry::recorder(),
+            address,
+        };
+        let db = state.queue.db().clone();
+        let stop = shutdown.clone();
+        tasks.spawn(async move {
+            let served = axum::serve(listener, http::router(state)).with_graceful_shutdown(async move { stop.cancelled().await });
+            if let Err(error) = served.await {
+                tracing::error!(%error, "the listener ended");
+            }
+        });
+        std::fs::write(config.data_dir.join("listen"), format!("http://{address}\n"))?;
+        Ok(Self { address, first_key, shutdown, tasks, db, _lock: lock })
+    }
+
+    /// The address really listened on.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The admin key that this start made; shown once and stored nowhere.
+    pub fn first_key(&self) -> Option<&str> {
+        self.first_key.as_deref()
+    }
+
+    /// Stops: no new requests, children killed and their jobs handed back, everything committed.
+    pub async fn stop(mut self) {
+        self.shutdown.cancel();
+        let ended = async { while self.tasks.join_next().await.is_some() {} };
+        if tokio::time::timeout(FAREWELL, ended).await.is_err() {
+            tracing::info!("closing connections that did not end");
+            self.tasks.shutdown().await;
+        }
+        self.db.close().await;
+    }
+}
+
+/// Queue and store of a configuration.
+struct Parts {
+    queue: Queue,
+    store: Store,
+}
+
+impl Parts {
+    async fn open(config: &Config) -> anyhow::Result<Self> {
+        let queue = Queue::new(Db::open(&config.database_file()?).await?);
+        let store = Store::local(&config.store_dir()?)?;
+        Ok(Self { queue, store })
+    }
+
+    /// Registers as a holder of leases, takes back the jobs of dead ones, and starts the worker slots.
+    async fn work(
+        &self,
+        config: &Arc<Config>,
+        shutdown: &CancellationToken,
+        tasks: &mut JoinSet<()>,
+    ) -> anyhow::Result<Option<Arc<Worker>>> {
+        let owner = Arc::new(Owner::register(&config.data_dir)?);
+        let dead = owner.dead()?;
+        let rescued = self.queue.rescue(&dead).await?;
+        if !rescued.is_empty() {
+            tracing::warn!(jobs = rescued.len(), "taken back from a process that died");
+        }
+        dead.iter().for_each(|name| owner.forget(name));
+        if config.workers == 0 {
+            return Ok(None);
+        }
+        let worker = Arc::new(Worker {
+            config: Arc::clone(config),
+            queue: self.queue.clone(),
+            store: self.store.clone(),
+            heartbeat: Heartbeat::start(&self.queue, config.database_file()?, Arc::clone(&owner))?,
+            owner,
+            shutdown: shutdown.clone(),
+        });
+        for _ in 0..config.workers {
+            tasks.spawn(Arc::clone(&worker).slot());
+        }
+        Ok(Some(worker))
+    }
+}
+
+fn upload_units(config: &Config) -> usize {
+    let units = config.upload_memory.max(config.max_body).div_ceil(UPLOAD_UNIT) + 1;
+    usize::try_from(units).unwrap_or(usize::MAX).min(Semaphore::MAX_PERMITS)
+}
+
+/// Two servers on one folder would each think the other's jobs its own.
+fn lock(data_dir: &Path) -> anyhow::Result<File> {
+    let file = File::create(data_dir.join("server.lock"))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            bail!("another server uses the data folder {}: stop it, or give another --data-dir", data_dir.display())
+        }
+        Err(TryLockError::Error(error)) => Err(error).context("cannot lock the data folder"),
+    }
+}
+
+/// Removes stored files that no job names: uploads that broke off before their commit, attempts that did not count,
+/// cancelled jobs. Only what is older than this start, so that nothing in flight is touched.
+async fn sweep(queue: Queue, store: Store, start: Uuid) {
+    let stored = match store.jobs().await {
+        Ok(jobs) => jobs,
+        Err(error) => return tracing::warn!(%error, "cannot sweep the store"),
+    };
+    for job in stored.into_iter().filter(|job| *job < start) {
+        let swept = match queue.is_known(job).await {
+            Ok(None | Some(JobState::Cancelled)) => store.erase_job(job).await,
+            Ok(Some(JobState::Succeeded)) => sweep_attempts(&queue, &store, job).await,
+            Ok(Some(_)) | Err(_) => Ok(()),
+        };
+        if let Err(error) = swept {
+            tracing::warn!(%job, %error, "cannot sweep");
+        }
+    }
+}
+
+/// Removes the files of attempts that the finished job does not name.
+async fn sweep_attempts(queue: &Queue, store: &Store, job: Uuid) -> Result<(), crate::store::Error> {
+    let Ok(named) = queue.artefacts(job).await else { return Ok(()) };
+    for fence in store.attempts(job).await? {
+        let prefix = format!("jobs/{job}/artefacts/{fence}/");
+        if !named.iter().any(|row| row.object_key.starts_with(&prefix)) {
+            store.erase_attempt(job, fence).await?;
+        }
+    }
+    Ok(())
+}
+
+/// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` on stdout, and at the
+/// first start the admin key with a portal link that carries it.
+///
+/// # Errors
+/// See [`Server::start`].
+pub async fn serve(config: Config) -> anyhow::Result<()> {
+    let server = Server::start(config).await?;
+    say(&format!("listening on http://{}", server.address()))?;
+    if let Some(key) = server.first_key() {
+        say(&format!("admin key (shown once): {key}"))?;
+        say(&format!("portal: http://{}/#key={key}", server.address()))?;
+    }
+    stop_signal().await?;
+    tracing::info!("stopping");
+    server.stop().await;
+    Ok(())
+}
+
+/// Works on the jobs of the same data folder without serving, until SIGINT or SIGTERM.
+///
+/// # Errors
+/// The database or the store cannot be opened; `workers` is 0.
+pub async fn work(config: Config) -> anyhow::Result<()> {
+    if config.workers == 0 {
+        bail!("a worker needs --workers 1 or more");
+    }
+    let config = Arc::new(config);
+    std::fs::create_dir_all(&config.data_dir)?;
+    let parts = Parts::open(&config).await?;
+    let shutdown = CancellationToken::new();
+    let mut tasks = JoinSet::new();
+    let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+    say(&format!("working on {} jobs at a time", config.workers))?;
+    stop_signal().await?;
+    shutdown.cancel();
+    while tasks.join_next().await.is_some() {}
+    drop(worker);
+    parts.queue.db().close().await;
+    Ok(())
+}
+
+fn say(line: &str) -> std::io::Result<()> {
+    use std::io::Write as _;
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{line}")?;
+    out.flush()
+}
+
+async fn stop_signal() -> std::io::Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate())?;
+    tokio::select! {
+        _ = terminate.recv() => Ok(()),
+        interrupt = tokio::signal::ctrl_c() => interrupt,
+    }
+}

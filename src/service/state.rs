@@ -1,0 +1,35 @@
+//! What every request handler shares.
+
+use crate::config::Config;
+use crate::queue::Queue;
+use crate::store::Store;
+use crate::worker::Worker;
+use metrics_exporter_prometheus::PrometheusHandle;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+
+/// The unit of the upload budget, bytes.
+pub const UPLOAD_UNIT: u64 = 1 << 20;
+
+/// Shared state; cheap to clone.
+#[derive(Clone, Debug)]
+pub struct State {
+    /// Settings.
+    pub config: Arc<Config>,
+    /// The job table.
+    pub queue: Queue,
+    /// The artefacts.
+    pub store: Store,
+    /// The workers of this process, if any.
+    pub worker: Option<Arc<Worker>>,
+    /// Memory for uploads, in units of [`UPLOAD_UNIT`].
+    pub uploads: Arc<Semaphore>,
+    /// Ends streams and long polls.
+    pub shutdown: CancellationToken,
+    /// Renders /metrics.
+    pub metrics: PrometheusHandle,
+    /// The address really listened on.
+    pub address: SocketAddr,
+}

@@ -1,0 +1,255 @@
+//! The artefact store: object keys and bytes, on a local folder with fsync.
+//!
+//! Keys: `jobs/<id>/input/NNNNNN` with a manifest beside them, and `jobs/<id>/artefacts/<fence>/<name>`. The fence in
+//! the key keeps a worker that lost its lease from overwriting the files of the one that holds it. An object exists
+//! for readers only once the job table names it; whatever else lies here is an orphan and is swept at start.
+
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::local::LocalFileSystem;
+use object_store::path::Path as Key;
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+use std::path::Path;
+use std::sync::Arc;
+use uuid::Uuid;
+
+/// What the store can answer.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The store's own error.
+    #[error("artefact store: {0}")]
+    Store(#[from] object_store::Error),
+    /// A stored object is not what was put there.
+    #[error("stored object {key} has digest {found} instead of {wanted}")]
+    Digest {
+        /// Object key.
+        key: String,
+        /// Digest of the bytes.
+        found: String,
+        /// Digest that was recorded.
+        wanted: String,
+    },
+    /// The manifest of an input cannot be read.
+    #[error("manifest of job {job}: {source}")]
+    Manifest {
+        /// Job id.
+        job: Uuid,
+        /// Why.
+        source: serde_json::Error,
+    },
+    /// A file of this machine.
+    #[error("{0}")]
+    Io(#[from] std::io::Error),
+}
+
+/// One input file in the manifest.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InputFile {
+    /// Harmless name.
+    pub name: String,
+    /// Size.
+    pub bytes: u64,
+    /// `sha256:...`.
+    pub digest: String,
+}
+
+/// A stored input.
+#[derive(Clone, Debug)]
+pub struct Input {
+    /// `sha256:` of the manifest, which holds name, size and digest of every file.
+    pub digest: String,
+    /// Files, in order.
+    pub files: Vec<InputFile>,
+}
+
+/// The store. Cheap to clone.
+#[derive(Clone, Debug)]
+pub struct Store {
+    objects: Arc<dyn ObjectStore>,
+}
+
+/// `sha256:` and 64 hex digits.
+pub fn digest(bytes: &[u8]) -> String {
+    format!("sha256:{}", hex(&Sha256::digest(bytes)))
+}
+
+/// Lower-case hex digits.
+pub fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+        // Writing into a String cannot fail.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+fn job_prefix(job: Uuid) -> Key {
+    Key::from_iter(["jobs", &job.to_string()])
+}
+
+fn input_key(job: Uuid, name: &str) -> Key {
+    Key::from_iter(["jobs", &job.to_string(), "input", name])
+}
+
+impl Store {
+    /// A store in a folder of this machine, made if missing; every put is synced to disk before it returns.
+    ///
+    /// # Errors
+    /// The folder cannot be made or opened.
+    pub fn local(folder: &Path) -> Result<Self, Error> {
+        std::fs::create_dir_all(folder)?;
+        let objects = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true).with_automatic_cleanup(true);
+        Ok(Self { objects: Arc::new(objects) })
+    }
+
+    /// Digests of an input's files and of its manifest, without storing anything.
+    pub fn describe(files: &[(String, Vec<u8>)]) -> Input {
+        let files: Vec<InputFile> = files
+            .iter()
+            .map(|(name, bytes)| InputFile { name: name.clone(), bytes: bytes.len() as u64, digest: digest(bytes) })
+            .collect();
+        Input { digest: digest(&manifest_bytes(&files)), files }
+    }
+
+    /// Stores an input; the manifest comes last, so that a manifest means a whole input.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn put_input(&self, job: Uuid, input: &Input, files: Vec<(String, Vec<u8>)>) -> Result<(), Error> {
+        for (i, (_, bytes)) in files.into_iter().enumerate() {
+            self.objects.put(&input_key(job, &format!("{i:06}")), bytes.into()).await?;
+        }
+        self.objects.put(&input_key(job, "manifest.json"), manifest_bytes(&input.files).into()).await?;
+        Ok(())
+    }
+
+    /// Writes a stored input into a folder of this machine, each file under its harmless name, digests checked.
+    ///
+    /// # Errors
+    /// The store's; a digest that does not match.
+    pub async fn fetch_input(&self, job: Uuid, wanted: &str, folder: &Path) -> Result<(), Error> {
+        let manifest = self.verified(&input_key(job, "manifest.json"), wanted).await?;
+        let files: Vec<InputFile> =
+            serde_json::from_slice(&manifest).map_err(|source| Error::Manifest { job, source })?;
+        for (i, file) in files.iter().enumerate() {
+            let bytes = self.verified(&input_key(job, &format!("{i:06}")), &file.digest).await?;
+            tokio::fs::write(folder.join(&file.name), &bytes).await?;
+        }
+        Ok(())
+    }
+
+    async fn verified(&self, key: &Key, wanted: &str) -> Result<bytes::Bytes, Error> {
+        let bytes = self.objects.get(key).await?.bytes().await?;
+        let found = digest(&bytes);
+        if found != wanted {
+            return Err(Error::Digest { key: key.to_string(), found, wanted: wanted.to_owned() });
+        }
+        Ok(bytes)
+    }
+
+    /// Stores an artefact of a job's attempt; returns its key and digest.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn put_artefact(
+        &self,
+        job: Uuid,
+        fence: i64,
+        name: &str,
+        bytes: Vec<u8>,
+    ) -> Result<(String, String), Error> {
+        let key = Key::from_iter(["jobs", &job.to_string(), "artefacts", &fence.to_string(), name]);
+        let digest = digest(&bytes);
+        self.objects.put(&key, bytes.into()).await?;
+        Ok((key.to_string(), digest))
+    }
+
+    /// Streams the bytes `range` of an object.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn stream(
+        &self,
+        key: &str,
+        range: std::ops::Range<u64>,
+    ) -> Result<futures::stream::BoxStream<'static, object_store::Result<bytes::Bytes>>, Error> {
+        if range.is_empty() {
+            return Ok(futures::stream::empty().boxed());
+        }
+        let options = object_store::GetOptions { range: Some(range.into()), ..Default::default() };
+        Ok(self.objects.get_opts(&Key::from(key), options).await?.into_stream())
+    }
+
+    /// A whole object.
+    ///
+    /// # Errors
+    /// The store's; a digest that does not match.
+    pub async fn bytes(&self, key: &str, digest: &str) -> Result<bytes::Bytes, Error> {
+        self.verified(&Key::from(key), digest).await
+    }
+
+    /// Erases everything of a job.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn erase_job(&self, job: Uuid) -> Result<(), Error> {
+        self.erase(job_prefix(job)).await
+    }
+
+    /// Erases what one attempt stored.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn erase_attempt(&self, job: Uuid, fence: i64) -> Result<(), Error> {
+        self.erase(Key::from_iter(["jobs", &job.to_string(), "artefacts", &fence.to_string()])).await
+    }
+
+    async fn erase(&self, prefix: Key) -> Result<(), Error> {
+        let found = self.objects.list(Some(&prefix)).map_ok(|meta| meta.location).boxed();
+        let mut deleted = self.objects.delete_stream(found);
+        while let Some(one) = deleted.next().await {
+            match one {
+                // Erased by somebody else at the same moment: gone is what was wanted.
+                Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
+                Err(other) => return Err(other.into()),
+            }
+        }
+        Ok(())
+    }
+
+    /// Ids of all jobs of which something is stored.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn jobs(&self) -> Result<Vec<Uuid>, Error> {
+        let listed = self.objects.list_with_delimiter(Some(&Key::from("jobs"))).await?;
+        Ok(listed.common_prefixes.iter().filter_map(|key| Uuid::parse_str(key.filename()?).ok()).collect())
+    }
+
+    /// Fences under which something of a job is stored.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn attempts(&self, job: Uuid) -> Result<Vec<i64>, Error> {
+        let prefix = Key::from_iter(["jobs", &job.to_string(), "artefacts"]);
+        let listed = self.objects.list_with_delimiter(Some(&prefix)).await?;
+        Ok(listed.common_prefixes.iter().filter_map(|key| key.filename()?.parse().ok()).collect())
+    }
+
+    /// Puts and removes a small object: whether the store takes writes.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn probe(&self) -> Result<(), Error> {
+        let key = Key::from(format!("probe/{}", Uuid::now_v7()));
+        self.objects.put(&key, "vasculum".into()).await?;
+        self.objects.delete(&key).await?;
+        Ok(())
+    }
+}
+
+fn manifest_bytes(files: &[InputFile]) -> Vec<u8> {
+    // Strings and numbers always serialise; an empty manifest would fail its digest check.
+    serde_json::to_vec(files).unwrap_or_default()
+}

@@ -1,0 +1,207 @@
+//! Workers: claim a job, run it as a child process, publish what it made.
+//!
+//! One job is one process, so that a crash or an out-of-memory kill ends the job and never the service. Each slot is
+//! an async task that only waits; beats come from an OS thread of their own ([`heartbeat`]), because a CPU-bound
+//! neighbour on an async runtime has starved beats into a livelock in a peer (5 starts in 22 s, never done).
+//!
+//! Order of publishing: every artefact into the store with fsync, then one transaction that names them all. A worker
+//! that lost its lease writes nothing more and drops what it stored.
+
+mod child;
+mod folder;
+mod heartbeat;
+mod owner;
+
+pub use heartbeat::Heartbeat;
+pub use owner::Owner;
+
+use crate::config::Config;
+use crate::error::Problem;
+use crate::media::media_type;
+use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict};
+use crate::store::Store;
+use child::{Child, Ended};
+use folder::Folder;
+use heartbeat::Held;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+/// How often an idle slot looks at the table when no hint comes.
+const POLL: Duration = Duration::from_secs(1);
+/// Pause of a slot after a fault of the database.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// What every slot shares.
+#[derive(Debug)]
+pub struct Worker {
+    /// Settings.
+    pub config: Arc<Config>,
+    /// The table.
+    pub queue: Queue,
+    /// The artefacts.
+    pub store: Store,
+    /// The beats.
+    pub heartbeat: Heartbeat,
+    /// Who we are in `lease_owner`.
+    pub owner: Arc<Owner>,
+    /// Ends everything.
+    pub shutdown: CancellationToken,
+}
+
+impl Worker {
+    /// One slot: claims and runs jobs until shutdown.
+    pub async fn slot(self: Arc<Self>) {
+        let mut changes = self.queue.changes();
+        while !self.shutdown.is_cancelled() {
+            match self.queue.claim(self.owner.name()).await {
+                Ok(Some(claim)) => self.job(&claim).await,
+                Ok(None) => tokio::select! {
+                    () = self.shutdown.cancelled() => {}
+                    _ = changes.recv() => {}
+                    () = tokio::time::sleep(POLL) => {}
+                },
+                Err(error) => {
+                    tracing::warn!(%error, "cannot claim");
+                    tokio::select! {
+                        () = self.shutdown.cancelled() => {}
+                        () = tokio::time::sleep(PAUSE) => {}
+                    }
+                }
+            }
+        }
+    }
+
+    /// Runs one claimed job to its end.
+    async fn job(&self, claim: &Claim) {
+        let held = self.heartbeat.hold(claim.uuid(), claim.fence);
+        tracing::info!(job = %claim.id, attempt = claim.attempt, trace_id = %claim.trace_id, "job starts");
+        let closing = match self.run(claim, &held).await {
+            Ok(closing) => closing,
+            Err(error) => {
+                tracing::error!(job = %claim.id, cause = %error, "job could not be run");
+                Some(Closing::Crashed("the service could not run it".to_owned()))
+            }
+        };
+        self.end(claim, closing).await;
+        drop(held);
+    }
+
+    /// `None`: the lease was lost on the way.
+    async fn run(&self, claim: &Claim, held: &Held) -> anyhow::Result<Option<Closing>> {
+        let folder = Folder::make(&self.owner, claim).await?;
+        if let Err(error) = self.store.fetch_input(claim.uuid(), &claim.input_digest, &folder.input()).await {
+            // Erased meanwhile, or cancelled: the lease says which.
+            return match held.verdict_now().await {
+                Verdict::Run => Err(error.into()),
+                Verdict::Cancel => Ok(Some(Closing::Cancelled)),
+                Verdict::Lost => Ok(None),
+            };
+        }
+        tokio::fs::write(folder.plan(), &claim.plan).await?;
+        let mut child = Child::start(&self.config, &folder, claim)?;
+        let ended = self.watch(&mut child, held, claim).await?;
+        let closing = match ended {
+            Some(Ended::Done) => match held.verdict() {
+                Verdict::Lost => None,
+                _ => Some(self.publish(claim, &folder).await?),
+            },
+            Some(Ended::Problem(problem)) => Some(Closing::Failed(problem)),
+            Some(Ended::Crashed(how)) => Some(Closing::Crashed(how)),
+            Some(Ended::Cancelled) => Some(Closing::Cancelled),
+            Some(Ended::HandedBack) => Some(Closing::HandedBack),
+            None => None,
+        };
+        folder.remove().await;
+        Ok(closing)
+    }
+
+    /// Waits for the child, passing its progress on, and kills it when the job is cancelled, lost or handed back.
+    async fn watch(&self, child: &mut Child, held: &Held, claim: &Claim) -> anyhow::Result<Option<Ended>> {
+        let mut changes = self.queue.changes();
+        let mut verdict = held.subscribe();
+        loop {
+            tokio::select! {
+                line = child.next() => match line {
+                    Some(step) => held.step(step),
+                    None => return Ok(Some(child.end(&claim.id).await?)),
+                },
+                change = changes.recv() => {
+                    if change.is_ok_and(|id| id == claim.uuid()) {
+                        held.ask();
+                    }
+                }
+                Ok(()) = verdict.changed() => {
+                    let now = *verdict.borrow_and_update();
+                    if now != Verdict::Run {
+                        child.kill().await;
+                        return Ok((now == Verdict::Cancel).then_some(Ended::Cancelled));
+                    }
+                }
+                () = self.shutdown.cancelled() => {
+                    child.kill().await;
+                    return Ok(Some(Ended::HandedBack));
+                }
+            }
+        }
+    }
+
+    /// Puts every file of the finished folder into the store.
+    async fn publish(&self, claim: &Claim, folder: &Folder) -> anyhow::Result<Closing> {
+        let mut artefacts = Vec::new();
+        for (name, path) in folder.artefacts().await? {
+            let bytes = tokio::fs::read(&path).await?;
+            let size = i64::try_from(bytes.len())?;
+            let (object_key, digest) = self.store.put_artefact(claim.uuid(), claim.fence, &name, bytes).await?;
+            artefacts.push(ArtefactRow {
+                media_type: media_type(&name).to_owned(),
+                name,
+                bytes: size,
+                digest,
+                object_key,
+            });
+        }
+        if artefacts.iter().all(|a| a.name != "result.json") {
+            return Ok(Closing::Failed(Problem::new(
+                axum::http::StatusCode::INTERNAL_SERVER_ERROR,
+                "job.no_result",
+                "The job's process ended well but left no result.json. This is a fault of the service: report it.",
+            )));
+        }
+        Ok(Closing::Succeeded(Published { artefacts }))
+    }
+
+    /// Writes the end, trying again while the database is away, and drops the files of an attempt that did not count.
+    async fn end(&self, claim: &Claim, closing: Option<Closing>) {
+        let mut reached = None;
+        if let Some(closing) = closing {
+            loop {
+                match self.queue.close(claim, &closing).await {
+                    Ok(state) => {
+                        reached = state;
+                        break;
+                    }
+                    // At shutdown the lease simply runs out and the next start takes the job back.
+                    Err(error) if self.shutdown.is_cancelled() => {
+                        tracing::warn!(job = %claim.id, %error, "end not written, the job will be taken back");
+                        return;
+                    }
+                    Err(error) => {
+                        tracing::warn!(job = %claim.id, %error, "end not written, trying again");
+                        tokio::time::sleep(PAUSE).await;
+                    }
+                }
+            }
+        }
+        tracing::info!(job = %claim.id, state = reached.map_or("lost", JobState::as_str), "job ends");
+        let erased = match reached {
+            Some(JobState::Succeeded) => return,
+            // A cancelled job forgets its scan: nothing of it stays on disk.
+            Some(JobState::Cancelled) => self.store.erase_job(claim.uuid()).await,
+            _ => self.store.erase_attempt(claim.uuid(), claim.fence).await,
+        };
+        if let Err(error) = erased {
+            tracing::warn!(job = %claim.id, %error, "files left behind; the sweep at the next start takes them");
+        }
+    }
+}
