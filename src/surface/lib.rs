@@ -1,5 +1,31 @@
-//! The implicit function to triangles: polygonise, project, remesh, cut and cap, distances, patches, checks.
+//! The implicit function to triangles: polygonise, project, cut and cap, remesh, distances, patches, checks.
+//!
+//! f = 0 on the wall, f > 0 in the lumen. The usual way: [`polygonise`] from the contour points, [`project`], [`cut`]
+//! by the planes at which the data end, [`remesh`], then [`check`], [`quality`], [`displacement`] and [`patches`].
 
+mod cap;
+mod cut;
+mod error;
+mod fabric;
+#[cfg(test)]
+mod fields;
+mod improve;
+mod land;
 mod mesh;
+mod polish;
+mod polygonise;
+mod quality;
+mod remesh;
+mod sizing;
+mod topology;
+mod web;
 
+pub use cap::Bounded;
+pub use cut::{Cap, CutReport, cut};
+pub use error::Error;
+pub use land::{ProjectReport, project};
 pub use mesh::{TriMesh, WALL};
+pub use polygonise::{PolygoniseReport, PolygoniseSettings, polygonise};
+pub use quality::{Quality, quality};
+pub use remesh::{RemeshReport, RemeshSettings, Sizing, remesh};
+pub use topology::{Defect, DefectKind, Topology, check};

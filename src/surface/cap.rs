@@ -1,0 +1,166 @@
+//! Closing rim loops with planar triangles.
+//!
+//! A constrained Delaunay triangulation of the rim's vertices in the cap's plane (crate spade, exact predicates), of
+//! which the triangles inside the loop are kept. No vertex is added, so rim edges are shared exactly.
+
+use crate::land::Flat;
+use crate::{Error, TriMesh};
+use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
+use space::P3;
+
+/// A closed loop of rim vertices, counterclockwise about the plane's outward normal.
+pub(crate) struct Rim {
+    pub(crate) vertices: Vec<u32>,
+    /// Number of the cut plane; the cap's id is one more.
+    pub(crate) plane: usize,
+}
+
+/// A loop in its plane.
+struct Outline {
+    at: Vec<[f64; 2]>,
+}
+
+impl Outline {
+    fn area(&self) -> f64 {
+        let n = self.at.len();
+        (0..n).fold(0.0, |s, i| {
+            let (p, q) = (self.at[i], self.at[(i + 1) % n]);
+            s + 0.5 * (p[0] * q[1] - q[0] * p[1])
+        })
+    }
+    /// Even-odd rule.
+    fn holds(&self, x: [f64; 2]) -> bool {
+        let n = self.at.len();
+        (0..n).fold(false, |inside, i| {
+            let (p, q) = (self.at[i], self.at[(i + 1) % n]);
+            let crosses = (p[1] > x[1]) != (q[1] > x[1])
+                && x[0] < (q[0] - p[0]) * (x[1] - p[1]) / (q[1] - p[1]) + p[0];
+            inside != crosses
+        })
+    }
+}
+
+/// Close every rim of one plane.
+pub(crate) fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<(), Error> {
+    let (e, f) = plane.normal.any_orthonormal_pair();
+    // (e, f, normal) right-handed, so that counterclockwise in the plane faces outward.
+    let f = if e.cross(f).dot(plane.normal) < 0.0 { -f } else { f };
+    let outlines: Vec<Outline> = rims
+        .iter()
+        .map(|r| {
+            let flat = |&v: &u32| {
+                let d = mesh.vertices[v as usize].raw() - plane.point;
+                [d.dot(e), d.dot(f)]
+            };
+            Outline { at: r.vertices.iter().map(flat).collect() }
+        })
+        .collect();
+    for (i, rim) in rims.iter().enumerate() {
+        let at = mesh.vertices[rim.vertices[0] as usize];
+        let nested = (0..rims.len()).any(|j| j != i && outlines[j].holds(outlines[i].at[0]));
+        if nested || outlines[i].area() <= 0.0 {
+            return Err(Error::NestedRims { plane: rim.plane, at });
+        }
+        let triangles = triangulate(&outlines[i]).ok_or(Error::CrossedRim { plane: rim.plane, at })?;
+        for t in triangles {
+            mesh.triangles.push(t.map(|k| rim.vertices[k]));
+            mesh.face_id.push(rim.plane as u32 + 1);
+        }
+    }
+    Ok(())
+}
+
+/// The triangles of a simple polygon by its vertex numbers; `None` when it crosses or touches itself.
+fn triangulate(outline: &Outline) -> Option<Vec<[usize; 3]>> {
+    let n = outline.at.len();
+    let mut cdt = ConstrainedDelaunayTriangulation::<Point2<f64>>::new();
+    let mut handles = Vec::with_capacity(n);
+    for p in &outline.at {
+        handles.push(cdt.insert(Point2::new(p[0], p[1])).ok()?);
+    }
+    if cdt.num_vertices() != n {
+        return None;
+    }
+    for i in 0..n {
+        let (a, b) = (handles[i], handles[(i + 1) % n]);
+        if !cdt.can_add_constraint(a, b) {
+            return None;
+        }
+        cdt.add_constraint(a, b);
+    }
+    let mut triangles: Vec<[usize; 3]> = cdt
+        .inner_faces()
+        .map(|face| face.vertices().map(|v| v.fix().index()))
+        .filter(|t| {
+            let [p, q, r] = t.map(|k| outline.at[k]);
+            outline.holds([(p[0] + q[0] + r[0]) / 3.0, (p[1] + q[1] + r[1]) / 3.0])
+        })
+        .collect();
+    triangles.iter_mut().for_each(|t| {
+        let least = (0..3).min_by_key(|&k| t[k]).unwrap_or(0);
+        t.rotate_left(least);
+    });
+    triangles.sort_unstable();
+    (triangles.len() == n - 2).then_some(triangles)
+}
+
+/// A field that closes itself a little outside some cut planes: min(f, `margin_mm` - distance outside).
+///
+/// Beyond the data a variational function may go anywhere. Polygonising this field instead keeps the surface within
+/// `margin_mm` of the cut planes; within the planes, and up to the margin outside, it is f itself, so [`crate::cut`] by
+/// the same planes gives the same result as without it. Not smooth at the margin: do not remesh on it.
+pub struct Bounded<'a> {
+    field: &'a dyn implicit::Field,
+    flats: Vec<Flat>,
+    margin_mm: f64,
+}
+
+impl<'a> Bounded<'a> {
+    /// Close `field` at `margin_mm` outside each plane.
+    pub fn new(field: &'a dyn implicit::Field, cuts: &[imaging::CutPlane], margin_mm: f64) -> Self {
+        Self { field, flats: cuts.iter().filter_map(Flat::of).collect(), margin_mm }
+    }
+    /// The plane that is nearest to being left, and the distance to its margin.
+    fn nearest(&self, x: P3) -> Option<(f64, Flat)> {
+        let room = self.flats.iter().map(|f| (self.margin_mm - f.height(x.raw()), *f));
+        room.min_by(|a, b| a.0.total_cmp(&b.0))
+    }
+}
+
+impl implicit::Field for Bounded<'_> {
+    fn value(&self, x: P3) -> f64 {
+        match self.nearest(x) {
+            // Outside the margin the sign is known: f is not needed, nor trusted.
+            Some((room, _)) if room <= 0.0 => room,
+            Some((room, _)) => room.min(self.field.value(x)),
+            None => self.field.value(x),
+        }
+    }
+    fn gradient(&self, x: P3) -> (f64, space::V3) {
+        let (f, g) = self.field.gradient(x);
+        match self.nearest(x) {
+            Some((room, plane)) if room < f => (room, -space::V3::from_raw(plane.normal)),
+            _ => (f, g),
+        }
+    }
+    fn hessian(&self, x: P3) -> (f64, space::V3, space::DMat3) {
+        let (f, g, h) = self.field.hessian(x);
+        match self.nearest(x) {
+            Some((room, plane)) if room < f => (room, -space::V3::from_raw(plane.normal), space::DMat3::ZERO),
+            _ => (f, g, h),
+        }
+    }
+    fn values(&self, xs: &[P3], out: &mut [f64]) {
+        self.field.values(xs, out);
+        for (o, &x) in out.iter_mut().zip(xs) {
+            match self.nearest(x) {
+                Some((room, _)) if room <= 0.0 => *o = room,
+                Some((room, _)) => *o = o.min(room),
+                None => {}
+            }
+        }
+    }
+    fn bounds(&self) -> space::Aabb<space::Patient> {
+        self.field.bounds()
+    }
+}
