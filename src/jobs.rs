@@ -8,6 +8,7 @@ use exec::Ctx;
 use indicatif::{ProgressBar, ProgressStyle};
 use pipeline::{Event, Failure};
 use serde_json::{Value, json};
+use space::Faulty;
 use std::io::{IsTerminal, Read, Write};
 use std::path::Path;
 use std::process::ExitCode;
@@ -60,7 +61,7 @@ pub(crate) fn exec(a: &ExecJob) -> ExitCode {
     match outcome {
         Ok(_) => ExitCode::SUCCESS,
         Err(failure) => {
-            line(&json!({"error": Problem::from_fault(&failure)}));
+            line(&json!({"error": problem(&failure)}));
             ExitCode::from(failure.kind.exit_code())
         }
     }
@@ -92,11 +93,17 @@ fn plan_of(path: Option<&Path>) -> Result<Plan, Failure> {
     Plan::parse(&bytes).map_err(Failure::plan)
 }
 
+/// The failure with all faults that came with it.
+fn problem(failure: &Failure) -> Problem {
+    let all = std::iter::once(failure).chain(&failure.others).map(|f| f as &dyn Faulty);
+    Problem::of_all(all).unwrap_or_else(|| Problem::of(failure))
+}
+
 fn report(failure: &Failure, as_json: bool) -> ExitCode {
     if as_json {
-        eprintln!("{}", Problem::from_fault(failure).json());
+        eprintln!("{}", json!(problem(failure)));
     } else {
-        eprintln!("vasculum: {}", Problem::from_fault(failure).words());
+        eprint!("vasculum: {}", problem(failure).plain());
     }
     ExitCode::from(failure.kind.exit_code())
 }

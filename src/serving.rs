@@ -66,7 +66,12 @@ fn intake(files: Vec<(String, Vec<u8>)>) -> Result<Vec<(String, Vec<u8>)>, Probl
 fn check_plan(bytes: &[u8]) -> Result<(), Problem> {
     match artefact::plan::Plan::parse(bytes) {
         Ok(_) => Ok(()),
-        Err(faults) => Err(Problem::from_faults(&faults.0)),
+        Err(faults) => {
+            let each = |f: &artefact::plan::PlanFault| {
+                serde_json::json!({"code": f.code, "message": f.message, "where": {"field": f.field}})
+            };
+            Err(Problem::from_fault(&faults).with_errors(faults.faults.iter().map(each).collect()))
+        }
     }
 }
 

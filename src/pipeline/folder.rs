@@ -1,7 +1,7 @@
 //! A folder that appears whole or not at all.
 
 use crate::Failure;
-use artefact::read::NamedBytes;
+use artefact::write::NamedBytes;
 use space::FaultKind;
 use std::ffi::OsString;
 use std::fs;
@@ -39,7 +39,7 @@ fn write_and_swap(out: &Path, partial: &Path, files: &[NamedBytes]) -> std::io::
     }
     fs::create_dir_all(partial)?;
     for file in files {
-        fs::write(partial.join(&file.name), &file.bytes)?;
+        fs::write(partial.join(file.name), &file.bytes)?;
     }
     if !out.exists() {
         return fs::rename(partial, out);
@@ -72,7 +72,7 @@ mod tests {
         fs::write(out.join("thesis.doc"), "mine").unwrap();
         assert_eq!(refuse_foreign(&out).unwrap_err().code, "output.taken");
         fs::remove_file(out.join("thesis.doc")).unwrap();
-        let files = |text: &str| vec![NamedBytes::new("provenance.json", text.as_bytes())];
+        let files = |text: &str| vec![NamedBytes { name: "provenance.json", bytes: text.into() }];
         publish(&out, &files("one")).unwrap();
         refuse_foreign(&out).unwrap();
         publish(&out, &files("two")).unwrap();

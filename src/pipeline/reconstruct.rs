@@ -1,7 +1,7 @@
 //! From a scan to all artefacts.
 
 use crate::facts;
-use crate::step::{Steps, cpu_seconds, peak_memory_bytes};
+use crate::step::{Steps, peak_memory_bytes};
 use crate::{Failure, Observer, folder};
 use artefact::plan::Plan;
 use artefact::read::{InputReport, Limits};
@@ -15,7 +15,6 @@ use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
 use space::{FaultKind, P3, Warning};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 use surface::{Displacement, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh};
 
 /// The surface with all that is known of it.
@@ -48,7 +47,7 @@ fn reconstruct(
     ctx: &Ctx,
     observer: Observer<'_>,
 ) -> Result<(Vec<NamedBytes>, Value), Failure> {
-    let started = (Instant::now(), facts::now_utc());
+    let started_at = facts::now_utc();
     refuse_unmade(plan)?;
     let mut steps = Steps::new(ctx, observer);
 
@@ -86,10 +85,8 @@ fn reconstruct(
         version: env!("CARGO_PKG_VERSION").into(),
         host_os: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
         threads: ctx.threads(),
-        started_at: started.1,
+        started_at,
         finished_at: Some(facts::now_utc()),
-        wall_s: started.0.elapsed().as_secs_f64(),
-        cpu_s: Some(cpu_seconds()),
         input_digest: input.digest,
         plan: plan.clone(),
         stages: steps.times.iter().map(facts::stage).collect(),

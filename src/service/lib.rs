@@ -22,7 +22,7 @@ pub mod worker;
 
 pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes};
 pub use error::{PROBLEM_JSON, Problem, place_json};
-pub use server::{Server, serve, work};
+pub use server::{Server, create_key, migrate, serve, work};
 
 /// The OpenAPI 3.1 document as YAML; the same bytes for the same version.
 pub fn openapi() -> String {

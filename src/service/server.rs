@@ -255,3 +255,25 @@ async fn stop_signal() -> std::io::Result<()> {
         interrupt = tokio::signal::ctrl_c() => interrupt,
     }
 }
+
+/// Bring the database to this version's schema.
+///
+/// # Errors
+/// The database cannot be opened, or holds a newer schema.
+pub async fn migrate(config: Config) -> anyhow::Result<()> {
+    std::fs::create_dir_all(&config.data_dir)?;
+    Db::open(&config.database_file()?).await?.close().await;
+    Ok(())
+}
+
+/// Make an admin key; it is stored as a digest and cannot be shown again.
+///
+/// # Errors
+/// The database's; no random bytes.
+pub async fn create_key(config: Config, label: &str) -> anyhow::Result<String> {
+    std::fs::create_dir_all(&config.data_dir)?;
+    let db = Db::open(&config.database_file()?).await?;
+    let key = auth::create_key(&db, label).await?;
+    db.close().await;
+    Ok(key)
+}

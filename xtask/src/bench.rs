@@ -35,7 +35,7 @@ fn show(runs: &[Value]) -> Result<()> {
     println!("{:<14} {:>9} {:>9}", "stage", "wall s", "CPU s");
     for (k, stage) in stages.iter().enumerate() {
         let median_of = |name: &str| median(runs.iter().filter_map(|r| r["stages"][k][name].as_f64()).collect());
-        let name = stage["name"].as_str().unwrap_or("?");
+        let name = stage["stage"].as_str().unwrap_or("?");
         println!("{name:<14} {:>9.2} {:>9.2}", median_of("wall_s"), median_of("cpu_s"));
     }
     let whole = |name: &str| median(runs.iter().filter_map(|r| r[name].as_f64()).collect());

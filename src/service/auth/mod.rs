@@ -94,6 +94,26 @@ pub async fn first_key(db: &Db) -> anyhow::Result<Option<String>> {
     Ok((made > 0).then_some(key))
 }
 
+/// Makes another admin key and returns it.
+///
+/// # Errors
+/// The database's; no random bytes.
+pub async fn create_key(db: &Db, label: &str) -> anyhow::Result<String> {
+    let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
+    sqlx::query(concat!(
+        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) VALUES ($1, $2, 'admin', $3, $4, ",
+        now!(),
+        ")"
+    ))
+    .bind(Uuid::now_v7().to_string())
+    .bind(DEFAULT_TENANT)
+    .bind(label)
+    .bind(digest(&key))
+    .execute(&db.writer)
+    .await?;
+    Ok(key)
+}
+
 fn digest(key: &str) -> Vec<u8> {
     Sha256::digest(key.as_bytes()).to_vec()
 }
