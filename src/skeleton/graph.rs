@@ -35,10 +35,18 @@ pub fn graph(volume: &BitVolume, grid: &Grid) -> MedialGraph {
     merge_passages(graph)
 }
 
-/// A closed line without a junction: its base node is its first voxel.
+/// A closed line without a junction: its base node is its first voxel. Three voxels that all touch enclose nothing:
+/// they are a lone end.
 fn closed_line(tracer: &Tracer, base: usize, traced: &mut [bool], graph: &mut MedialGraph, grid: &Grid) {
     let position = tracer.position(base, grid);
     let node = graph.nodes.len();
+    if let &[a, b] = tracer.near[base].as_slice() {
+        if tracer.near[a].contains(&b) {
+            [base, a, b].iter().for_each(|&v| traced[v] = true);
+            graph.nodes.push(Node { kind: NodeKind::End, position, radius_mm: 0.0, cap: None });
+            return;
+        }
+    }
     graph.nodes.push(Node { kind: NodeKind::Junction, position, radius_mm: 0.0, cap: None });
     traced[base] = true;
     let mut points = vec![position];
@@ -90,8 +98,8 @@ impl Tracer {
             let node = Some(self.nodes);
             self.nodes += 1;
             self.node_of[start] = node;
-            let mut stack = vec![start];
-            while let Some(v) = stack.pop().filter(|_| self.near[start].len() > 2) {
+            let mut stack = if self.near[start].len() > 2 { vec![start] } else { Vec::new() };
+            while let Some(v) = stack.pop() {
                 for &w in &self.near[v] {
                     if self.near[w].len() > 2 && self.node_of[w].is_none() {
                         self.node_of[w] = node;

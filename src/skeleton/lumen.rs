@@ -68,10 +68,6 @@ impl<'a> Lumen<'a> {
         self.domain.contains(x)
     }
 
-    pub(crate) fn field(&self) -> &dyn Field {
-        self.domain.field
-    }
-
     /// Whether the voxel nearest to a point is lumen.
     fn voxel(&self, x: P3) -> bool {
         let v = self.to_voxel.point(x).to_array().map(f64::round);

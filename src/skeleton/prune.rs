@@ -1,0 +1,162 @@
+//! Spurs: leaf branches that the roughness of the wall grew, and not a vessel.
+//!
+//! A leaf branch whose tip lies within the inscribed sphere at its junction (times a factor) shows nothing that the
+//! sphere does not already fill. Such branches are dropped, the smallest first, and what becomes a passage is joined,
+//! until none is left. Loops stay. A tip that meets a cap of the surface stays whatever its length, one for each cap.
+
+use crate::graph::{merge_passages, without_nodes};
+use crate::{CapHint, Edge, Error, Lumen, MedialGraph, NodeKind, Settings};
+use exec::Ctx;
+use space::{P3, Place, Warning};
+
+/// Reach of a cap, in inscribed radii at its centroid, in which a tip belongs to it when it sees the centroid. Thinning
+/// ends some one radius short of a flat cap and about two short of one that is cut at 60 degrees; the second round is
+/// for ends that a rough wall shortened further.
+const REACH: [f64; 2] = [3.0, 6.0];
+
+/// What pruning did.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PruneReport {
+    /// Leaf branches dropped.
+    pub spurs: usize,
+    /// Pieces too compact to have a line, dropped.
+    pub warnings: Vec<Warning>,
+}
+
+/// Drop spurs from `graph`, one after the other, each time the one that is smallest against the inscribed radius at its
+/// junction. Pieces without a line as long as their radius (a blob, a lone voxel) are dropped too, each with the warning
+/// `skeleton.compact_piece`. Inscribed radii are measured at the nodes.
+///
+/// # Errors
+/// [`Error::Cancelled`]; [`Error::NoLine`] when nothing is left.
+pub fn prune(
+    mut graph: MedialGraph,
+    lumen: &Lumen<'_>,
+    caps: &[CapHint],
+    settings: &Settings,
+    ctx: &Ctx,
+) -> Result<(MedialGraph, PruneReport), Error> {
+    let radii = ctx.map(&graph.nodes, |n| lumen.inscribed(n.position).unwrap_or(0.0))?;
+    for (node, r) in graph.nodes.iter_mut().zip(radii) {
+        node.radius_mm = r;
+    }
+    let caps = Caps::new(lumen, caps);
+    let mut report = PruneReport::default();
+    while let Some(edge) = smallest_spur(&graph, lumen, &caps, settings) {
+        ctx.check()?;
+        graph = without_leaf(graph, edge);
+        report.spurs += 1;
+    }
+    let graph = without_compact_pieces(graph, lumen, &caps, &mut report);
+    if graph.edges.is_empty() {
+        return Err(Error::NoLine);
+    }
+    Ok((graph, report))
+}
+
+/// The junction (first) and the tip of an edge that is a leaf branch.
+fn leaf(graph: &MedialGraph, degree: &[usize], edge: usize) -> Option<[usize; 2]> {
+    let [a, b] = graph.edges[edge].nodes;
+    match (degree[a], degree[b]) {
+        (d, 1) if d > 2 => Some([a, b]),
+        (1, d) if d > 2 => Some([b, a]),
+        _ => None,
+    }
+}
+
+fn smallest_spur(graph: &MedialGraph, lumen: &Lumen<'_>, caps: &Caps, settings: &Settings) -> Option<usize> {
+    let degree: Vec<usize> = graph.incidence().iter().map(Vec::len).collect();
+    let kept = caps.tips(graph, lumen);
+    let size = |e: usize| {
+        let [junction, tip] = leaf(graph, &degree, e)?;
+        let radii = graph.edges[e].length_mm() / graph.nodes[junction].radius_mm.max(f64::MIN_POSITIVE);
+        (radii < settings.prune_radii && !kept.contains(&Some(tip))).then_some((radii, e))
+    };
+    (0..graph.edges.len()).filter_map(size).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, e)| e)
+}
+
+/// The graph without a leaf branch and its tip. A junction that is left with one branch becomes an end.
+fn without_leaf(mut graph: MedialGraph, edge: usize) -> MedialGraph {
+    let nodes = graph.edges.remove(edge).nodes;
+    let gone: Vec<bool> = (0..graph.nodes.len()).map(|n| nodes.contains(&n) && graph.degree(n) == 0).collect();
+    for node in nodes {
+        if graph.degree(node) == 1 {
+            graph.nodes[node].kind = NodeKind::End;
+        }
+    }
+    merge_passages(without_nodes(graph, &gone))
+}
+
+fn without_compact_pieces(
+    mut graph: MedialGraph,
+    lumen: &Lumen<'_>,
+    caps: &Caps,
+    report: &mut PruneReport,
+) -> MedialGraph {
+    let degree: Vec<usize> = graph.incidence().iter().map(Vec::len).collect();
+    let kept = caps.tips(&graph, lumen);
+    let compact = |edge: &Edge| {
+        let [a, b] = edge.nodes;
+        let radius = graph.nodes[a].radius_mm.max(graph.nodes[b].radius_mm);
+        let capped = kept.contains(&Some(a)) || kept.contains(&Some(b));
+        degree[a] == 1 && degree[b] == 1 && !capped && edge.length_mm() < radius
+    };
+    let dropped: Vec<bool> = graph.edges.iter().map(compact).collect();
+    let mut keep = dropped.iter().map(|d| !d);
+    graph.edges.retain(|_| keep.next().unwrap_or(true));
+    let gone: Vec<bool> = graph.incidence().iter().map(Vec::is_empty).collect();
+    for (node, _) in graph.nodes.iter().zip(&gone).filter(|(n, g)| **g && n.kind == NodeKind::End) {
+        let message = format!(
+            "a piece of the lumen of {:.2} mm inscribed radius is a blob without a medial line; it is left out",
+            node.radius_mm
+        );
+        report.warnings.push(Warning::new("skeleton.compact_piece", message, Place::at(node.position)));
+    }
+    without_nodes(graph, &gone)
+}
+
+/// The caps with the inscribed radius at their centroids.
+pub(crate) struct Caps {
+    caps: Vec<(CapHint, f64)>,
+}
+
+impl Caps {
+    pub(crate) fn new(lumen: &Lumen<'_>, caps: &[CapHint]) -> Self {
+        let radius = |c: &CapHint| lumen.inscribed(c.centroid).unwrap_or(2.0 * lumen.spacing_mm());
+        Self { caps: caps.iter().map(|c| (*c, radius(c))).collect() }
+    }
+
+    pub(crate) fn hints(&self) -> impl Iterator<Item = &(CapHint, f64)> {
+        self.caps.iter()
+    }
+
+    /// For each cap the end node that meets it: greedily the pair whose inscribed sphere comes nearest to the centroid,
+    /// first among tips within three radii of a cap, then, for caps without a tip, within six.
+    pub(crate) fn tips(&self, graph: &MedialGraph, lumen: &Lumen<'_>) -> Vec<Option<usize>> {
+        let mut tip_of: Vec<Option<usize>> = vec![None; self.caps.len()];
+        for reach in REACH {
+            let mut pairs: Vec<(f64, usize, usize)> = Vec::new();
+            for (c, (cap, radius)) in self.caps.iter().enumerate().filter(|(c, _)| tip_of[*c].is_none()) {
+                let slack = 2.0 * lumen.spacing_mm();
+                for (n, node) in graph.nodes.iter().enumerate().filter(|(_, n)| n.kind == NodeKind::End) {
+                    let d = node.position.distance(cap.centroid);
+                    if d <= reach * radius + slack && lumen.sees(node.position, inner(cap, lumen)) {
+                        pairs.push((d - node.radius_mm, c, n));
+                    }
+                }
+            }
+            pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+            for (_, c, n) in pairs {
+                if tip_of[c].is_none() && !tip_of.contains(&Some(n)) {
+                    tip_of[c] = Some(n);
+                }
+            }
+        }
+        tip_of
+    }
+}
+
+/// A point one voxel inside a cap's centroid: the cap itself lies on the border of the lumen.
+fn inner(cap: &CapHint, lumen: &Lumen<'_>) -> P3 {
+    cap.centroid - cap.normal * lumen.spacing_mm()
+}
