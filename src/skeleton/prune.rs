@@ -1,6 +1,7 @@
 //! Spurs: leaf branches that the roughness of the wall grew, and not a vessel.
 //!
-//! A leaf branch whose tip lies within the inscribed sphere at its junction (times a factor) shows nothing that the
+//! A leaf branch whose tip lies within the inscribed sphere at its junction (times a factor; the straight distance
+//! counts, since the length of a voxel line depends on its direction) shows nothing that the
 //! sphere does not already fill. Such branches are dropped, the smallest first, and what becomes a passage is joined,
 //! until none is left. Loops stay. A tip that meets a cap of the surface stays whatever its length, one for each cap.
 
@@ -14,6 +15,10 @@ use space::{P3, Place, Warning};
 /// for ends that a rough wall shortened further.
 const REACH: [f64; 2] = [3.0, 6.0];
 
+/// A piece whose line is shorter than this many of its inscribed radii is a blob: thinning shortens a tube by a radius
+/// at each end, so that this is a tube of less than two diameters. A voxelised ball leaves a line of 1.3 radii.
+const COMPACT_RADII: f64 = 2.0;
+
 /// What pruning did.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PruneReport {
@@ -24,7 +29,7 @@ pub struct PruneReport {
 }
 
 /// Drop spurs from `graph`, one after the other, each time the one that is smallest against the inscribed radius at its
-/// junction. Pieces without a line as long as their radius (a blob, a lone voxel) are dropped too, each with the warning
+/// junction. Pieces whose line is shorter than two radii (a blob, a lone voxel) are dropped too, each with the warning
 /// `skeleton.compact_piece`. Inscribed radii are measured at the nodes.
 ///
 /// # Errors
@@ -69,7 +74,8 @@ fn smallest_spur(graph: &MedialGraph, lumen: &Lumen<'_>, caps: &Caps, settings: 
     let kept = caps.tips(graph, lumen);
     let size = |e: usize| {
         let [junction, tip] = leaf(graph, &degree, e)?;
-        let radii = graph.edges[e].length_mm() / graph.nodes[junction].radius_mm.max(f64::MIN_POSITIVE);
+        let stretch = graph.nodes[junction].position.distance(graph.nodes[tip].position);
+        let radii = stretch / graph.nodes[junction].radius_mm.max(f64::MIN_POSITIVE);
         (radii < settings.prune_radii && !kept.contains(&Some(tip))).then_some((radii, e))
     };
     (0..graph.edges.len()).filter_map(size).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, e)| e)
@@ -97,9 +103,10 @@ fn without_compact_pieces(
     let kept = caps.tips(&graph, lumen);
     let compact = |edge: &Edge| {
         let [a, b] = edge.nodes;
-        let radius = graph.nodes[a].radius_mm.max(graph.nodes[b].radius_mm);
+        let middle = lumen.inscribed(edge.points[edge.points.len() / 2]).unwrap_or(0.0);
+        let radius = middle.max(graph.nodes[a].radius_mm).max(graph.nodes[b].radius_mm);
         let capped = kept.contains(&Some(a)) || kept.contains(&Some(b));
-        degree[a] == 1 && degree[b] == 1 && !capped && edge.length_mm() < radius
+        degree[a] == 1 && degree[b] == 1 && !capped && edge.length_mm() < COMPACT_RADII * radius
     };
     let dropped: Vec<bool> = graph.edges.iter().map(compact).collect();
     let mut keep = dropped.iter().map(|d| !d);
