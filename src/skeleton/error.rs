@@ -160,9 +160,7 @@ impl Faulty for Error {
             | Self::Line { edge: e, at, .. }
             | Self::Abscissa { edge: e, at, .. }
             | Self::Outside { edge: e, at, .. }
-            | Self::Radius { edge: e, at, .. } => {
-                Place { element: Some(*e), position: Some(*at), ..Place::default() }
-            }
+            | Self::Radius { edge: e, at, .. } => Place { element: Some(*e), position: Some(*at), ..Place::default() },
             _ => Place::none(),
         }
     }

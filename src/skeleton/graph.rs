@@ -40,12 +40,12 @@ pub fn graph(volume: &BitVolume, grid: &Grid) -> MedialGraph {
 fn closed_line(tracer: &Tracer, base: usize, traced: &mut [bool], graph: &mut MedialGraph, grid: &Grid) {
     let position = tracer.position(base, grid);
     let node = graph.nodes.len();
-    if let &[a, b] = tracer.near[base].as_slice() {
-        if tracer.near[a].contains(&b) {
-            [base, a, b].iter().for_each(|&v| traced[v] = true);
-            graph.nodes.push(Node { kind: NodeKind::End, position, radius_mm: 0.0, cap: None });
-            return;
-        }
+    if let &[a, b] = tracer.near[base].as_slice()
+        && tracer.near[a].contains(&b)
+    {
+        [base, a, b].iter().for_each(|&v| traced[v] = true);
+        graph.nodes.push(Node { kind: NodeKind::End, position, radius_mm: 0.0, cap: None });
+        return;
     }
     graph.nodes.push(Node { kind: NodeKind::Junction, position, radius_mm: 0.0, cap: None });
     traced[base] = true;
@@ -113,10 +113,12 @@ impl Tracer {
     /// A line voxel between two adjacent voxels of one junction is part of it: no loop of the object passes there.
     fn absorb_corners(&mut self) {
         for v in 0..self.voxels.len() {
-            if let (None, &[a, b]) = (self.node_of[v], self.near[v].as_slice()) {
-                if self.node_of[a].is_some() && self.node_of[a] == self.node_of[b] && self.near[a].contains(&b) {
-                    self.node_of[v] = self.node_of[a];
-                }
+            if let (None, &[a, b]) = (self.node_of[v], self.near[v].as_slice())
+                && self.node_of[a].is_some()
+                && self.node_of[a] == self.node_of[b]
+                && self.near[a].contains(&b)
+            {
+                self.node_of[v] = self.node_of[a];
             }
         }
     }
@@ -200,9 +202,8 @@ pub(crate) fn merge_passages(mut graph: MedialGraph) -> MedialGraph {
         first.points.extend(second.points.into_iter().skip(1));
         first.radius_mm.extend(second.radius_mm.into_iter().skip(1));
     }
-    let bare: Vec<bool> = (0..graph.nodes.len())
-        .map(|n| graph.nodes[n].kind == NodeKind::Junction && graph.degree(n) == 0)
-        .collect();
+    let bare: Vec<bool> =
+        (0..graph.nodes.len()).map(|n| graph.nodes[n].kind == NodeKind::Junction && graph.degree(n) == 0).collect();
     without_nodes(graph, &bare)
 }
 

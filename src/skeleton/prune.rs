@@ -15,6 +15,9 @@ use space::{P3, Place, Warning};
 /// for ends that a rough wall shortened further.
 const REACH: [f64; 2] = [3.0, 6.0];
 
+/// The same as [`Settings::prune_radii`] for tips at a cap that another tip meets better: the rim of a flat cap is
+/// sqrt 2 radii from the last inscribed sphere (1.30 was met after thinning), that of an oblique one farther.
+const RIM_RADII: f64 = 2.0;
 /// A piece whose line is shorter than this many of its inscribed radii is a blob: thinning shortens a tube by a radius
 /// at each end, so that this is a tube of less than two diameters. A voxelised ball leaves a line of 1.3 radii.
 const COMPACT_RADII: f64 = 2.0;
@@ -76,7 +79,9 @@ fn smallest_spur(graph: &MedialGraph, lumen: &Lumen<'_>, caps: &Caps, settings: 
         let [junction, tip] = leaf(graph, &degree, e)?;
         let stretch = graph.nodes[junction].position.distance(graph.nodes[tip].position);
         let radii = stretch / graph.nodes[junction].radius_mm.max(f64::MIN_POSITIVE);
-        (radii < settings.prune_radii && !kept.contains(&Some(tip))).then_some((radii, e))
+        let at_cap = caps.has_near(graph.nodes[tip].position, lumen);
+        let spur = if at_cap { settings.prune_radii.max(RIM_RADII) } else { settings.prune_radii };
+        (radii < spur && !kept.contains(&Some(tip))).then_some((radii, e))
     };
     (0..graph.edges.len()).filter_map(size).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, e)| e)
 }
@@ -135,6 +140,14 @@ impl Caps {
 
     pub(crate) fn hints(&self) -> impl Iterator<Item = &(CapHint, f64)> {
         self.caps.iter()
+    }
+
+    /// Whether a point lies in the first reach of a cap and sees it.
+    fn has_near(&self, x: P3, lumen: &Lumen<'_>) -> bool {
+        let slack = 2.0 * lumen.spacing_mm();
+        self.caps.iter().any(|(cap, radius)| {
+            x.distance(cap.centroid) <= REACH[0] * radius + slack && lumen.sees(x, inner(cap, lumen))
+        })
     }
 
     /// For each cap the end node that meets it: greedily the pair whose inscribed sphere comes nearest to the centroid,

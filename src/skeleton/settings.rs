@@ -5,21 +5,22 @@ use crate::Error;
 /// Settings of [`crate::medial_graph`]; the defaults are fully automatic.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Spacing of the voxel lattice, mm; `None` chooses a quarter of the smallest lumen radius seen from the seeds (at
-    /// 2.5 voxels per radius the tests' bifurcation still gives 3 ends and 1 junction; at 4 a vessel that is a third
-    /// narrower than the 5 % quantile that is looked at still does), not finer than `automatic_voxels` allows.
+    /// Spacing of the voxel lattice, mm; `None` chooses a quarter of the smallest lumen radius seen from the seeds (their
+    /// 5 % quantile; at 2.5 voxels per radius the tests' bifurcation still gives 3 ends and 1 junction at every shift of
+    /// the lattice), not finer than `automatic_voxels` allows.
     pub spacing_mm: Option<f64>,
-    /// Voxels that the automatic spacing may use: 256^3. A bifurcation's graph does not change above it, the time does.
+    /// Voxels that the automatic spacing may use: 256^3.
     pub automatic_voxels: usize,
     /// Voxels above which a lattice is refused: 640^3 (32 MiB of bits).
     pub max_voxels: usize,
-    /// A leaf branch is a spur when it is shorter than this many inscribed radii at its junction, 1.0 to 2.0. With
-    /// 0.35 voxel of boundary noise, spurs up to 1.2 radii were met on the tests' phantoms.
+    /// A leaf branch is a spur when its tip is nearer to its junction than this many inscribed radii there, 1.0 to 2.0.
+    /// At 1.3 no spur is left on the tests' bifurcation with 0.35 voxel of wall ripple at 4 to 15 voxels per radius.
     pub prune_radii: f64,
-    /// Rays of a cross-section, at least 16. The centroid converges faster than any power of it; 64 leave less than
-    /// 1e-3 mm on a section as long as 2.5 times its width.
+    /// Rays of a cross-section, at least 16. On a smooth outline the centroid converges faster than any power of
+    /// their number.
     pub rays: usize,
-    /// Recentring passes. The first moves a line by up to 1.3 voxel, the third by less than .001.
+    /// Recentring passes. On straight tubes the axis is exact to 1e-5 mm after the first; the junction of a 45 degree
+    /// graft is off by .06 mm after the first, .001 mm after the second, and stays there.
     pub passes: usize,
 }
 

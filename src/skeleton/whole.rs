@@ -75,7 +75,8 @@ pub fn medial_graph(
 fn ends_without_cap(graph: &MedialGraph) -> Vec<Warning> {
     let free = graph.nodes.iter().enumerate().filter(|(_, n)| n.kind == NodeKind::End && n.cap.is_none());
     free.map(|(i, node)| {
-        let message = format!("branch end {i} (inscribed radius {:.2} mm) reaches no cap of the surface", node.radius_mm);
+        let message =
+            format!("branch end {i} (inscribed radius {:.2} mm) reaches no cap of the surface", node.radius_mm);
         let place = Place { element: Some(i), ..Place::at(node.position) };
         Warning::new("skeleton.end_without_cap", message, place)
     })

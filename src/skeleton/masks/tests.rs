@@ -198,10 +198,12 @@ fn every_direction_has_21_masks_that_need_background_towards_it_and_are_those_of
         }
     }
     // The set is closed under reflection, so any isometry that takes U to a direction gives the same masks.
-    let mirrored = |bits: u32| (0..27).filter(|&b| bits >> b & 1 == 1).fold(0, |o, b| {
-        let d = step(b);
-        o | 1 << bit([-d[0], d[1], d[2]])
-    });
+    let mirrored = |bits: u32| {
+        (0..27).filter(|&b| bits >> b & 1 == 1).fold(0, |o, b| {
+            let d = step(b);
+            o | 1 << bit([-d[0], d[1], d[2]])
+        })
+    };
     for m in &up {
         assert!(up.contains(&Mask { zero: mirrored(m.zero), one: mirrored(m.one), any: mirrored(m.any) }));
     }

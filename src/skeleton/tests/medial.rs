@@ -27,7 +27,8 @@ fn tube(centre: P3, direction: V3, radius: f64, oblique: f64) -> (Vessel, Vec<Cu
     let side = d.any_orthonormal();
     let vessel = Vessel::new(&[(centre - d * 20.0, centre + d * 20.0, radius)]);
     let normal = d * oblique.cos() + side * oblique.sin();
-    let (cuts, caps) = [opening(1, centre + d * 12.0, normal), opening(2, centre - d * 12.0, d * -1.0)].into_iter().unzip();
+    let (cuts, caps) =
+        [opening(1, centre + d * 12.0, normal), opening(2, centre - d * 12.0, d * -1.0)].into_iter().unzip();
     (vessel, cuts, caps)
 }
 
@@ -37,8 +38,7 @@ fn a_straight_tube_in_any_direction_gives_its_axis_from_cap_to_cap() {
     for (i, d) in directions.into_iter().enumerate() {
         let centre = P3::new(3.1 + 0.17 * i as f64, -40.0, 7.3);
         let (vessel, cuts, caps) = tube(centre, V3::from(d), 3.0, 0.0);
-        let (graph, report) =
-            medial_graph(&vessel, &cuts, &caps, &[centre], &Settings::default(), &ctx()).unwrap();
+        let (graph, report) = medial_graph(&vessel, &cuts, &caps, &[centre], &Settings::default(), &ctx()).unwrap();
         assert_eq!(counts(&graph), (2, 0, 0, 1), "{d:?}");
         assert!(report.warnings.is_empty(), "{:?}", report.warnings);
         let edge = &graph.edges[0];
@@ -68,8 +68,11 @@ fn an_end_at_an_oblique_cap_reaches_its_centroid_on_the_axis() {
 
 fn y_shape(shift: f64) -> Star {
     let centre = P3::new(1.0 + shift, -2.0 + 0.7 * shift, 0.4 * shift);
-    let branches =
-        [(V3::new(0.1, 0.0, -1.0), 22.0, 3.0), (V3::new(0.7, 0.2, 1.0), 20.0, 2.2), (V3::new(-0.6, 0.3, 1.0), 20.0, 2.5)];
+    let branches = [
+        (V3::new(0.1, 0.0, -1.0), 22.0, 3.0),
+        (V3::new(0.7, 0.2, 1.0), 20.0, 2.2),
+        (V3::new(-0.6, 0.3, 1.0), 20.0, 2.5),
+    ];
     star(centre, &branches)
 }
 
@@ -174,10 +177,8 @@ fn a_torus_is_one_cycle_on_its_circle() {
 #[test]
 fn a_closed_tip_is_kept_and_named_in_a_warning() {
     let star = y_shape(0.0);
-    let (cuts, caps): (Vec<_>, Vec<_>) =
-        star.cuts.iter().zip(&star.caps).take(2).map(|(c, h)| (*c, *h)).unzip();
-    let (graph, report) =
-        medial_graph(&star.vessel, &cuts, &caps, &star.seeds, &at_spacing(0.4), &ctx()).unwrap();
+    let (cuts, caps): (Vec<_>, Vec<_>) = star.cuts.iter().zip(&star.caps).take(2).map(|(c, h)| (*c, *h)).unzip();
+    let (graph, report) = medial_graph(&star.vessel, &cuts, &caps, &star.seeds, &at_spacing(0.4), &ctx()).unwrap();
     assert_eq!(counts(&graph), (3, 1, 0, 1));
     let codes: Vec<_> = report.warnings.iter().map(|w| w.code).collect();
     assert_eq!(codes, ["skeleton.end_without_cap"]);
@@ -188,8 +189,11 @@ fn a_closed_tip_is_kept_and_named_in_a_warning() {
 
 #[test]
 fn turning_the_vessel_by_90_degrees_turns_the_graph() {
-    let branches =
-        [(V3::new(0.1, 0.0, -1.0), 22.0, 3.0), (V3::new(0.7, 0.2, 1.0), 20.0, 2.2), (V3::new(-0.6, 0.3, 1.0), 20.0, 2.5)];
+    let branches = [
+        (V3::new(0.1, 0.0, -1.0), 22.0, 3.0),
+        (V3::new(0.7, 0.2, 1.0), 20.0, 2.2),
+        (V3::new(-0.6, 0.3, 1.0), 20.0, 2.5),
+    ];
     let h = 0.4;
     let (first, _) = of(&star(P3::ORIGIN, &branches), &at_spacing(h));
     let turns: [fn([f64; 3]) -> [f64; 3]; 3] =

@@ -40,7 +40,8 @@ fn slow_reference(volume: &BitVolume) -> (BitVolume, usize) {
             .filter(|&p| {
                 let mut n = 0;
                 for d in (0..27).map(|b| [b % 3 - 1, b / 3 % 3 - 1, b / 9 - 1]) {
-                    let q = [p[0] as isize + d[0] as isize, p[1] as isize + d[1] as isize, p[2] as isize + d[2] as isize];
+                    let q =
+                        [p[0] as isize + d[0] as isize, p[1] as isize + d[1] as isize, p[2] as isize + d[2] as isize];
                     n |= u32::from(v.at(q)) << bit(d);
                 }
                 deletable(&set, n)

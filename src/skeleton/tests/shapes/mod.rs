@@ -7,16 +7,16 @@ use skeleton::{CapHint, Edge, MedialGraph};
 use space::{Aabb, DMat3, P3, Patient, V3};
 
 /// Tubes joined by a sharp smooth maximum: f = ln(sum exp(k f_i)) / k, f_i = radius - distance to the segment.
-pub struct Vessel {
-    pub tubes: Vec<(P3, P3, f64)>,
-    pub sharpness: f64,
+pub(crate) struct Vessel {
+    pub(crate) tubes: Vec<(P3, P3, f64)>,
+    pub(crate) sharpness: f64,
     /// Amplitude and wavelength of the wall's ripple, mm.
-    pub ripple: [f64; 2],
-    pub bounds: Aabb<Patient>,
+    pub(crate) ripple: [f64; 2],
+    pub(crate) bounds: Aabb<Patient>,
 }
 
 impl Vessel {
-    pub fn new(tubes: &[(P3, P3, f64)]) -> Self {
+    pub(crate) fn new(tubes: &[(P3, P3, f64)]) -> Self {
         let ends = tubes.iter().flat_map(|t| [t.0, t.1]);
         let r = tubes.iter().map(|t| t.2).fold(0.0, f64::max);
         let bounds = Aabb::around(ends).unwrap().grown(1.2 * r);
@@ -69,10 +69,10 @@ impl Field for Vessel {
 }
 
 /// A solid torus about z.
-pub struct Torus {
-    pub centre: P3,
-    pub big: f64,
-    pub small: f64,
+pub(crate) struct Torus {
+    pub(crate) centre: P3,
+    pub(crate) big: f64,
+    pub(crate) small: f64,
 }
 
 impl Field for Torus {
@@ -95,23 +95,23 @@ impl Field for Torus {
 }
 
 /// A cut plane and a cap at `centroid`, `outward` need not be of unit length.
-pub fn opening(face_id: u32, centroid: P3, outward: V3) -> (CutPlane, CapHint) {
+pub(crate) fn opening(face_id: u32, centroid: P3, outward: V3) -> (CutPlane, CapHint) {
     let normal = outward.normalised().unwrap();
     (CutPlane { point: centroid, outward: normal }, CapHint { face_id, centroid, normal })
 }
 
 /// Straight branches from `centre`: (direction, length, radius). Each is cut at a right angle at its length (the tube
 /// goes on behind it).
-pub struct Star {
-    pub vessel: Vessel,
-    pub cuts: Vec<CutPlane>,
-    pub caps: Vec<CapHint>,
-    pub seeds: Vec<P3>,
-    pub centre: P3,
-    pub directions: Vec<V3>,
+pub(crate) struct Star {
+    pub(crate) vessel: Vessel,
+    pub(crate) cuts: Vec<CutPlane>,
+    pub(crate) caps: Vec<CapHint>,
+    pub(crate) seeds: Vec<P3>,
+    pub(crate) centre: P3,
+    pub(crate) directions: Vec<V3>,
 }
 
-pub fn star(centre: P3, branches: &[(V3, f64, f64)]) -> Star {
+pub(crate) fn star(centre: P3, branches: &[(V3, f64, f64)]) -> Star {
     let directions: Vec<V3> = branches.iter().map(|b| b.0.normalised().unwrap()).collect();
     let tubes: Vec<_> =
         branches.iter().zip(&directions).map(|(b, d)| (centre, centre + *d * (b.1 + 2.0 * b.2), b.2)).collect();
@@ -129,7 +129,7 @@ pub fn star(centre: P3, branches: &[(V3, f64, f64)]) -> Star {
 }
 
 /// The edge that ends at a cap, from the cap inwards.
-pub fn from_cap(graph: &MedialGraph, face_id: u32) -> Edge {
+pub(crate) fn from_cap(graph: &MedialGraph, face_id: u32) -> Edge {
     let node = graph.nodes.iter().position(|n| n.cap == Some(face_id)).unwrap();
     let mut edge = graph.edges.iter().find(|e| e.nodes.contains(&node)).unwrap().clone();
     if edge.nodes[0] != node {
@@ -141,13 +141,13 @@ pub fn from_cap(graph: &MedialGraph, face_id: u32) -> Edge {
 }
 
 /// Distance of a point from a line.
-pub fn off_axis(x: P3, through: P3, direction: V3) -> f64 {
+pub(crate) fn off_axis(x: P3, through: P3, direction: V3) -> f64 {
     let d = direction.normalised().unwrap();
     (x - through).cross(d).length()
 }
 
 /// (ends, junctions, cycles, components)
-pub fn counts(graph: &MedialGraph) -> (usize, usize, usize, usize) {
+pub(crate) fn counts(graph: &MedialGraph) -> (usize, usize, usize, usize) {
     let ends = graph.nodes.iter().filter(|n| n.kind == skeleton::NodeKind::End).count();
     (ends, graph.nodes.len() - ends, graph.cycles(), graph.components())
 }
