@@ -1,8 +1,12 @@
 //! Ends at the caps of the surface.
 
-use crate::prune::Caps;
-use crate::{Lumen, MedialGraph};
-use space::{P3, V3};
+use crate::prune::{Caps, inner};
+use crate::{Edge, Lumen, MedialGraph, Node, NodeKind};
+use space::{P3, Place, V3, Warning};
+
+/// How far a cap may lie from the line of the vessel that it opens, in that vessel's inscribed radii and in its own:
+/// thinning leaves no branch when it ends within a radius of the wall of its parent.
+const STUB_REACH: [f64; 2] = [1.5, 3.0];
 
 /// A planar cap of the surface, where a vessel leaves the data.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,18 +22,33 @@ pub struct CapHint {
 /// Extend the ends near caps to the caps' centroids and note the cap in [`crate::Node::cap`]. Thinning ends about one
 /// radius short of a cap, and its last piece may turn to the cap's rim: points within one inscribed radius of the
 /// centroid are replaced by the straight line to it. Each cap takes at most one end, each end at most one cap.
-pub fn extend_to_caps(graph: &mut MedialGraph, lumen: &Lumen<'_>, caps: &[CapHint]) {
+///
+/// A cap that no end meets but that the line of a vessel near it sees is a stub, cut so close to its parent that thinning
+/// left nothing of it: it gets a junction on that line and a straight branch, and the warning `skeleton.stub`.
+pub fn extend_to_caps(graph: &mut MedialGraph, lumen: &Lumen<'_>, caps: &[CapHint]) -> Vec<Warning> {
     let caps = Caps::new(lumen, caps);
     let tips = caps.tips(graph, lumen);
-    for ((cap, radius), tip) in caps.hints().zip(tips) {
-        let Some(tip) = tip else { continue };
-        let Some(e) = graph.edges.iter().position(|e| e.nodes.contains(&tip)) else { continue };
+    let mut warnings = Vec::new();
+    for ((cap, radius), tip) in caps.hints().zip(&tips) {
+        if let Some(tip) = *tip {
+            extend(graph, tip, cap, *radius);
+        }
+    }
+    for ((cap, radius), _) in caps.hints().zip(&tips).filter(|(_, tip)| tip.is_none()) {
+        warnings.extend(attach_stub(graph, cap, *radius, lumen));
+    }
+    warnings
+}
+
+/// Replace the last radius of the branch that ends at `tip` by the straight line to the cap.
+fn extend(graph: &mut MedialGraph, tip: usize, cap: &CapHint, radius: f64) {
+    if let Some(e) = graph.edges.iter().position(|e| e.nodes.contains(&tip)) {
         let edge = &mut graph.edges[e];
         let turned = edge.nodes[1] != tip;
         if turned {
             edge.reverse();
         }
-        let near = |p: &P3| p.distance(cap.centroid) < *radius || (*p - cap.centroid).dot(cap.normal) > 0.0;
+        let near = |p: &P3| p.distance(cap.centroid) < radius || (*p - cap.centroid).dot(cap.normal) > 0.0;
         while edge.points.len() > 1 && edge.points.last().is_some_and(near) {
             edge.points.pop();
         }
@@ -39,6 +58,47 @@ pub fn extend_to_caps(graph: &mut MedialGraph, lumen: &Lumen<'_>, caps: &[CapHin
             edge.reverse();
         }
         let node = &mut graph.nodes[tip];
-        (node.position, node.radius_mm, node.cap) = (cap.centroid, *radius, Some(cap.face_id));
+        (node.position, node.radius_mm, node.cap) = (cap.centroid, radius, Some(cap.face_id));
     }
+}
+
+/// A junction on the nearest line that sees the cap, and a straight branch from it to the cap.
+fn attach_stub(graph: &mut MedialGraph, cap: &CapHint, radius: f64, lumen: &Lumen<'_>) -> Option<Warning> {
+    let slack = 2.0 * lumen.spacing_mm();
+    let mut points: Vec<(f64, usize, usize)> = Vec::new();
+    for (e, edge) in graph.edges.iter().enumerate() {
+        let inside = 1..edge.points.len().saturating_sub(1);
+        points.extend(inside.map(|i| (edge.points[i].distance(cap.centroid), e, i)));
+    }
+    points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (_, e, i) = points.into_iter().find(|&(_, e, i)| lumen.sees(graph.edges[e].points[i], inner(cap, lumen)))?;
+    let from = graph.edges[e].points[i];
+    let parent = lumen.inscribed(from)?;
+    let length = from.distance(cap.centroid);
+    if length > STUB_REACH[0] * parent + STUB_REACH[1] * radius + slack {
+        return None;
+    }
+    let (junction, end) = (graph.nodes.len(), graph.nodes.len() + 1);
+    graph.nodes.push(Node { kind: NodeKind::Junction, position: from, radius_mm: parent, cap: None });
+    let tip = Node { kind: NodeKind::End, position: cap.centroid, radius_mm: radius, cap: Some(cap.face_id) };
+    graph.nodes.push(tip);
+    split(graph, e, i, junction);
+    graph.edges.push(Edge { nodes: [junction, end], points: vec![from, cap.centroid], radius_mm: vec![0.0; 2] });
+    let message = format!(
+        "cap {} lies {length:.2} mm from its parent's line, whose inscribed radius is {parent:.2} mm there: too near for a \
+         medial line of its own; a straight line stands for the branch and its direction means nothing",
+        cap.face_id
+    );
+    Some(Warning::new("skeleton.stub", message, Place::at(cap.centroid)))
+}
+
+/// Cut edge `e` at its point `i`, where node `at` lies.
+fn split(graph: &mut MedialGraph, e: usize, i: usize, at: usize) {
+    let edge = &mut graph.edges[e];
+    let points = edge.points.split_off(i);
+    let radius_mm = edge.radius_mm.split_off(i);
+    edge.points.push(points[0]);
+    edge.radius_mm.push(0.0);
+    let last = std::mem::replace(&mut edge.nodes[1], at);
+    graph.edges.push(Edge { nodes: [at, last], points, radius_mm });
 }

@@ -177,6 +177,6 @@ impl Caps {
 }
 
 /// A point one voxel inside a cap's centroid: the cap itself lies on the border of the lumen.
-fn inner(cap: &CapHint, lumen: &Lumen<'_>) -> P3 {
+pub(crate) fn inner(cap: &CapHint, lumen: &Lumen<'_>) -> P3 {
     cap.centroid - cap.normal * lumen.spacing_mm()
 }

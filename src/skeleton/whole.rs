@@ -24,7 +24,7 @@ pub struct Report {
     /// Spurs dropped.
     pub spurs: usize,
     /// What the reader of the result must know: `skeleton.coarse`, `skeleton.compact_piece`,
-    /// `skeleton.end_without_cap`.
+    /// `skeleton.stub`, `skeleton.end_without_cap`.
     pub warnings: Vec<Warning>,
 }
 
@@ -57,10 +57,10 @@ pub fn medial_graph(
         return Err(Error::Setting { name: "spacing_mm", value: h, range: "positive and finite" });
     };
     let (mut graph, pruning) = prune(graph(&thinned, &grid), &lumen, caps, &settings, ctx)?;
-    extend_to_caps(&mut graph, &lumen, caps);
+    let stubs = extend_to_caps(&mut graph, &lumen, caps);
     recentre(&mut graph, &lumen, &settings, &ctx.part(0.5, 1.0))?;
     check(&graph, field, caps)?;
-    let warnings = coarse.into_iter().chain(pruning.warnings).chain(ends_without_cap(&graph)).collect();
+    let warnings = coarse.into_iter().chain(pruning.warnings).chain(stubs).chain(ends_without_cap(&graph)).collect();
     let report = Report {
         voxels: volume.count(),
         size: volume.size(),

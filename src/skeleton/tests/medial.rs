@@ -255,6 +255,20 @@ fn a_cap_that_no_branch_reaches_is_a_fault_at_its_place() {
 }
 
 #[test]
+fn a_side_branch_cut_close_to_its_parent_is_a_stub_with_a_warning() {
+    for (beyond, expected) in [(0.3, 1), (1.5, 0)] {
+        let star = star(P3::ORIGIN, &[(V3::Z, 20.0, 3.0), (-V3::Z, 20.0, 3.0), (V3::X, 3.0 + beyond, 1.2)]);
+        let (graph, report) = of(&star, &at_spacing(0.4));
+        assert_eq!(counts(&graph), (3, 1, 0, 1), "{beyond}");
+        assert_axes(&star, &graph, 5.0, 0.02);
+        let stubs = report.warnings.iter().filter(|w| w.code == "skeleton.stub").count();
+        assert_eq!(stubs, expected, "{beyond}: {:?}", report.warnings);
+        let junction = graph.nodes.iter().find(|n| n.kind == NodeKind::Junction).unwrap();
+        assert!(junction.position.distance(P3::ORIGIN) < 1.0, "{beyond}: {:?}", junction.position);
+    }
+}
+
+#[test]
 fn too_fine_a_lattice_is_a_limit_and_a_bad_setting_an_input_fault() {
     let star = y_shape(0.0);
     let run = |s: &Settings| medial_graph(&star.vessel, &star.cuts, &star.caps, &star.seeds, s, &ctx()).unwrap_err();
