@@ -39,12 +39,7 @@ const STILL_MM: f64 = 1e-7;
 ///
 /// # Errors
 /// [`Error::Settings`] for a pixel that is not positive, [`Error::NotFinite`], [`Error::Cancelled`].
-pub fn displacement(
-    mesh: &TriMesh,
-    reference: &dyn Field,
-    pixel_mm: f64,
-    ctx: &Ctx,
-) -> Result<Displacement, Error> {
+pub fn displacement(mesh: &TriMesh, reference: &dyn Field, pixel_mm: f64, ctx: &Ctx) -> Result<Displacement, Error> {
     if !(pixel_mm.is_finite() && pixel_mm > 0.0) {
         return Err(Error::Settings { field: "pixel_mm", value: pixel_mm, need: "a positive length" });
     }

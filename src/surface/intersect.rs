@@ -46,9 +46,8 @@ pub fn self_intersections(mesh: &TriMesh, ctx: &Ctx) -> Result<Vec<[usize; 2]>, 
             }
             match node.children {
                 Some((l, r)) => open.extend([l, r]),
-                None => found.extend(
-                    (order[node.range.0..node.range.1].iter().copied()).filter(|&s| s > t && meet(mesh, t, s)),
-                ),
+                None => found
+                    .extend((order[node.range.0..node.range.1].iter().copied()).filter(|&s| s > t && meet(mesh, t, s))),
             }
         }
         found.sort_unstable();
@@ -59,9 +58,9 @@ pub fn self_intersections(mesh: &TriMesh, ctx: &Ctx) -> Result<Vec<[usize; 2]>, 
 
 fn grow(boxes: &[(DVec3, DVec3)], order: &mut [usize], range: (usize, usize), nodes: &mut Vec<Node>) -> usize {
     let part = &mut order[range.0..range.1];
-    let (lo, hi) = part.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), &t| {
-        (lo.min(boxes[t].0), hi.max(boxes[t].1))
-    });
+    let (lo, hi) = part
+        .iter()
+        .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lo, hi), &t| (lo.min(boxes[t].0), hi.max(boxes[t].1)));
     let me = nodes.len();
     nodes.push(Node { lo, hi, range, children: None });
     if part.len() > LEAF {

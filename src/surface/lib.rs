@@ -21,6 +21,8 @@ mod quality;
 mod remesh;
 mod sizing;
 mod sparse;
+#[cfg(test)]
+mod survey;
 mod topology;
 mod web;
 

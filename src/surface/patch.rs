@@ -163,8 +163,7 @@ struct Region<'a> {
 
 impl<'a> Region<'a> {
     fn new(mesh: &'a TriMesh, web: &'a Web, label: &[usize], l: usize) -> Self {
-        let inside: Vec<bool> =
-            (0..label.len()).map(|t| mesh.face_id[t] == WALL && label[t] == l).collect();
+        let inside: Vec<bool> = (0..label.len()).map(|t| mesh.face_id[t] == WALL && label[t] == l).collect();
         let triangles: Vec<usize> = (0..inside.len()).filter(|&t| inside[t]).collect();
         let mut end = vec![None; mesh.vertices.len()];
         for pass in [0.0, 1.0] {

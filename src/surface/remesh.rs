@@ -123,12 +123,7 @@ pub fn remesh(
 }
 
 /// Land every vertex exactly and account for the result.
-fn finish(
-    mut fabric: Fabric<'_>,
-    mended: usize,
-    longest: f64,
-    ctx: &Ctx,
-) -> Result<(TriMesh, RemeshReport), Error> {
+fn finish(mut fabric: Fabric<'_>, mended: usize, longest: f64, ctx: &Ctx) -> Result<(TriMesh, RemeshReport), Error> {
     compact(&mut fabric)?;
     let all = fabric.living();
     fabric.settle(&all, Approach::exact(longest), ctx)?;
