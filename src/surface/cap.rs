@@ -5,8 +5,8 @@
 
 use crate::land::Flat;
 use crate::{Error, TriMesh};
-use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
 use space::P3;
+use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
 
 /// A closed loop of rim vertices, counterclockwise about the plane's outward normal.
 pub(crate) struct Rim {
@@ -33,8 +33,7 @@ impl Outline {
         let n = self.at.len();
         (0..n).fold(false, |inside, i| {
             let (p, q) = (self.at[i], self.at[(i + 1) % n]);
-            let crosses = (p[1] > x[1]) != (q[1] > x[1])
-                && x[0] < (q[0] - p[0]) * (x[1] - p[1]) / (q[1] - p[1]) + p[0];
+            let crosses = (p[1] > x[1]) != (q[1] > x[1]) && x[0] < (q[0] - p[0]) * (x[1] - p[1]) / (q[1] - p[1]) + p[0];
             inside != crosses
         })
     }

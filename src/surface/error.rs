@@ -84,7 +84,9 @@ pub enum Error {
         at: P3,
     },
     /// One rim lies inside another.
-    #[error("cut plane {plane} meets a lumen with a hole (one rim lies inside another): cut where the section is simple")]
+    #[error(
+        "cut plane {plane} meets a lumen with a hole (one rim lies inside another): cut where the section is simple"
+    )]
     NestedRims {
         /// Plane number in the order given.
         plane: usize,
@@ -108,7 +110,9 @@ pub enum Error {
         at: P3,
     },
     /// A cap lies in none of the given planes.
-    #[error("cap {cap} lies in none of the {planes} cut planes (nearest {distance_mm:e} mm): give the planes it was cut by")]
+    #[error(
+        "cap {cap} lies in none of the {planes} cut planes (nearest {distance_mm:e} mm): give the planes it was cut by"
+    )]
     CapPlane {
         /// Face id of the cap.
         cap: u32,

@@ -83,15 +83,7 @@ impl<'a> Fabric<'a> {
     pub(crate) fn new(mesh: &TriMesh, field: &'a dyn Field, planes: Vec<Flat>) -> Result<Self, Error> {
         let web = Web::weave(mesh)?;
         let n = web.at.len();
-        Ok(Self {
-            web,
-            field,
-            planes,
-            gradient: vec![DVec3::ZERO; n],
-            size: vec![0.0; n],
-            evaluations: 0,
-            hessians: 0,
-        })
+        Ok(Self { web, field, planes, gradient: vec![DVec3::ZERO; n], size: vec![0.0; n], evaluations: 0, hessians: 0 })
     }
 
     fn plane(&self, id: u32) -> Option<Flat> {

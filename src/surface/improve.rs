@@ -34,7 +34,8 @@ pub(crate) fn split_long(fabric: &mut Fabric<'_>, rule: &Rule, limit: usize, ctx
         let mut fresh = Vec::with_capacity(long.len());
         for (_, h) in long {
             let (a, b) = (fabric.web.origin[h as usize] as usize, fabric.web.target(h) as usize);
-            let (size, gradient) = (0.5 * (fabric.size[a] + fabric.size[b]), 0.5 * (fabric.gradient[a] + fabric.gradient[b]));
+            let (size, gradient) =
+                (0.5 * (fabric.size[a] + fabric.size[b]), 0.5 * (fabric.gradient[a] + fabric.gradient[b]));
             let middle = 0.5 * (fabric.web.at[a] + fabric.web.at[b]);
             fresh.push(fabric.web.split(h, middle));
             fabric.size.push(size);

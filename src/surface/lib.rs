@@ -5,27 +5,36 @@
 
 mod cap;
 mod cut;
+mod distance;
 mod error;
 mod fabric;
 #[cfg(test)]
 mod fields;
 mod improve;
+mod intersect;
 mod land;
 mod mesh;
+mod patch;
 mod polish;
 mod polygonise;
 mod quality;
 mod remesh;
 mod sizing;
+mod sparse;
+#[cfg(test)]
+mod survey;
 mod topology;
 mod web;
 
 pub use cap::Bounded;
 pub use cut::{Cap, CutReport, cut};
+pub use distance::{Displacement, displacement};
 pub use error::Error;
+pub use intersect::self_intersections;
 pub use land::{ProjectReport, project};
 pub use mesh::{TriMesh, WALL};
+pub use patch::{Patches, patches};
 pub use polygonise::{PolygoniseReport, PolygoniseSettings, polygonise};
 pub use quality::{Quality, quality};
 pub use remesh::{RemeshReport, RemeshSettings, Sizing, remesh};
-pub use topology::{Defect, DefectKind, Topology, check};
+pub use topology::{Defect, DefectKind, Topology, check, topology};

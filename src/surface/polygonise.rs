@@ -62,8 +62,7 @@ const KEEP_OFF: f64 = 0.04;
 /// Lattice points per parallel chunk: 256 values of 5 us are about a millisecond.
 const VALUES_CHUNK: usize = 256;
 /// Corner offsets of a cube; bit 0 is x, bit 1 y, bit 2 z.
-const CORNER: [Cell; 8] =
-    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
+const CORNER: [Cell; 8] = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
 /// The six neighbours and the corners of the shared faces.
 const FACE: [(Cell, [usize; 4]); 6] = [
     ([-1, 0, 0], [0, 2, 4, 6]),
@@ -74,7 +73,8 @@ const FACE: [(Cell, [usize; 4]); 6] = [
     ([0, 0, 1], [4, 5, 6, 7]),
 ];
 /// Kuhn's six tetrahedra about the diagonal 0-7, all positively oriented.
-const TETRAHEDRA: [[usize; 4]; 6] = [[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 6, 4, 7]];
+const TETRAHEDRA: [[usize; 4]; 6] =
+    [[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 6, 4, 7]];
 
 fn key(c: Cell) -> u64 {
     let part = |x: i32| u64::from((x + LATTICE_REACH) as u32);
@@ -191,15 +191,11 @@ fn first_cells(
     report.evaluations += feet.iter().map(|l| l.evaluations).sum::<usize>();
     let reach = 2.0 * lattice.cell_mm;
     let close = |l: &crate::land::Landing, p: &P3| l.distance.is_finite() && l.at.distance(p.raw()) <= reach;
-    let near: Vec<Cell> = (feet.iter().zip(&stray))
-        .filter(|(l, p)| close(l, p))
-        .filter_map(|(l, _)| lattice.cell_of(l.at))
-        .collect();
+    let near: Vec<Cell> =
+        (feet.iter().zip(&stray)).filter(|(l, p)| close(l, p)).filter_map(|(l, _)| lattice.cell_of(l.at)).collect();
     report.seeds_off += stray.len() - near.len();
-    let mut around: Vec<Cell> = near
-        .iter()
-        .flat_map(|&c| (0..27).map(move |i| plus(c, [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1])))
-        .collect();
+    let mut around: Vec<Cell> =
+        near.iter().flat_map(|&c| (0..27).map(move |i| plus(c, [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1]))).collect();
     sort_cells(&mut around);
     report.cells_visited += around.len();
     report.evaluations += lattice.learn(&around, ctx)?;

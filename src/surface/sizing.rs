@@ -46,12 +46,7 @@ fn edge_for(curvature: f64, error: f64, [least, most]: [f64; 2]) -> f64 {
 }
 
 /// Wanted sizes at some vertices by the sizing rule, before grading. Caps take the longest; grading brings them down.
-pub(crate) fn measure(
-    fabric: &mut Fabric<'_>,
-    vertices: &[u32],
-    rule: &Rule,
-    ctx: &Ctx,
-) -> Result<(), Error> {
+pub(crate) fn measure(fabric: &mut Fabric<'_>, vertices: &[u32], rule: &Rule, ctx: &Ctx) -> Result<(), Error> {
     let sizes: Vec<(f64, usize)> = match rule.sizing {
         Sizing::Uniform(h) => vec![(h, 0); vertices.len()],
         Sizing::Curvature => ctx.map(vertices, |&v| {

@@ -67,20 +67,30 @@ pub struct Topology {
     pub genus: i64,
 }
 
-/// Check that a mesh is a closed, consistently oriented 2-manifold without degenerate triangles, and give its Euler
-/// number. Cost: one sort of the edges.
+/// Check that a mesh is a closed, consistently oriented 2-manifold whose triangles all have an area, and give its Euler
+/// number. Cost: two sorts. Holds for the meshes of [`crate::remesh`]; raw ones of [`crate::polygonise`] and
+/// [`crate::cut`] may hold flat triangles where the lattice is aligned with the wall: see [`topology`].
 ///
 /// # Errors
 /// The first offending element.
 pub fn check(mesh: &TriMesh) -> Result<Topology, Defect> {
-    duplicates(mesh)?;
-    let web = Web::weave(mesh)?;
+    let topology = topology(mesh)?;
     for t in 0..mesh.triangles.len() {
         let area = mesh.area_vector(t).length();
         if !(area.is_finite() && area > 0.0) {
             return Err(Defect { kind: DefectKind::Degenerate, element: t, at: mesh.corners(t)[0] });
         }
     }
+    Ok(topology)
+}
+
+/// As [`check`], by connectivity alone.
+///
+/// # Errors
+/// The first offending element.
+pub fn topology(mesh: &TriMesh) -> Result<Topology, Defect> {
+    duplicates(mesh)?;
+    let web = Web::weave(mesh)?;
     let components = pieces(&web).1;
     let (v, t) = (mesh.vertices.len() as i64, mesh.triangles.len() as i64);
     // A closed triangle mesh has 3 t / 2 edges.

@@ -1,0 +1,156 @@
+//! The whole way from f to a checked mesh over a table of phantoms, lattice shifts and thread counts.
+#![allow(clippy::unwrap_used)]
+
+use crate::fields::{self, Analytic};
+use crate::*;
+use exec::Ctx;
+use imaging::CutPlane;
+use space::{Faulty, P3, V3};
+
+/// A small generator (splitmix64), so that the phantoms are the same everywhere.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+    fn between(&mut self, a: f64, b: f64) -> f64 {
+        a + (b - a) * self.roll()
+    }
+}
+
+fn phantom(dice: &mut Dice, kind: usize) -> (Analytic, P3, Vec<CutPlane>, i64) {
+    match kind % 3 {
+        0 => {
+            let (ring, tube) = (dice.between(4.0, 5.0), dice.between(1.2, 1.8));
+            (fields::torus(ring, tube), P3::new(ring + tube, 0.0, 0.0), vec![], 0)
+        }
+        1 => {
+            let r = dice.between(2.0, 3.0);
+            (fields::sphere(P3::ORIGIN, r), P3::new(r, 0.0, 0.0), vec![], 2)
+        }
+        _ => {
+            let (angle, r) = (dice.between(0.6, 1.4), dice.between(1.2, 2.0));
+            let branches = vec![
+                (V3::Z, 12.0, 1.6),
+                (V3::new(0.0, 0.17, -0.985), 12.0, 1.6),
+                (V3::new(angle.sin(), 0.0, angle.cos()), 12.0, r),
+            ];
+            let cuts = vec![
+                CutPlane { point: P3::new(0.0, 0.0, 9.0), outward: V3::Z },
+                CutPlane { point: P3::new(0.0, 0.0, -9.0), outward: -V3::Z },
+            ];
+            (fields::tree(branches, vec![1.0, 1.5]), P3::new(0.0, 0.0, 13.6), cuts, 2)
+        }
+    }
+}
+
+fn whole(field: &Analytic, seed: P3, cuts: &[CutPlane], shift: [f64; 3], sizing: Sizing, ctx: &Ctx) -> TriMesh {
+    let s = PolygoniseSettings { cell_mm: 0.5, shift, ..PolygoniseSettings::default() };
+    let (mut raw, report) = polygonise(field, &[seed], &s, ctx).unwrap();
+    assert!(report.cells_visited as f64 <= 1.2 * report.cells as f64 + 30.0, "{report:?}");
+    project(&mut raw, field, 0.5, ctx).unwrap();
+    let (closed, _) = cut(&raw, field, cuts, ctx).unwrap();
+    let s = RemeshSettings { sizing, ..RemeshSettings::default() };
+    remesh(&closed, field, cuts, &s, ctx).unwrap().0
+}
+
+#[test]
+fn thirty_phantoms_and_shifts_are_closed_and_well_shaped() {
+    let ctx = Ctx::new(2).unwrap();
+    let mut dice = Dice(7);
+    let mut least = f64::INFINITY;
+    for i in 0..36 {
+        let (field, seed, cuts, euler) = phantom(&mut dice, i);
+        // Every third round is aligned with the lattice.
+        let shift = if i % 9 < 3 { [0.0; 3] } else { [dice.roll(), dice.roll(), dice.roll()] };
+        let sizing = if i % 2 == 0 { Sizing::Uniform(0.5) } else { Sizing::Curvature };
+        let mesh = whole(&field, seed, &cuts, shift, sizing, &ctx);
+        let found = check(&mesh).unwrap();
+        assert_eq!((found.euler, found.components), (euler, 1), "phantom {i}");
+        assert!(self_intersections(&mesh, &ctx).unwrap().is_empty(), "phantom {i}");
+        let q = quality(&mesh, &field, &ctx).unwrap();
+        eprintln!("{i}: {:.1} {:.1} {:.4} {}", q.min_angle_deg, q.max_angle_deg, q.face_max_mm, mesh.triangles.len());
+        assert!(q.min_angle_deg >= 30.0 && q.max_angle_deg <= 120.0, "phantom {i}: {q:?}");
+        assert!(q.vertex_max_mm <= 1e-9, "phantom {i}: {q:?}");
+        least = least.min(q.min_angle_deg);
+    }
+    eprintln!("smallest angle of all {least}");
+}
+
+#[test]
+fn one_and_three_threads_give_the_same_bytes() {
+    let mesh = |threads| {
+        let ctx = Ctx::new(threads).unwrap();
+        let (field, seed, cuts, _) = phantom(&mut Dice(3), 2);
+        let mesh = whole(&field, seed, &cuts, [0.3, 0.1, 0.7], Sizing::Curvature, &ctx);
+        let p = patches(&mesh, &(0..mesh.face_id.iter().copied().max().unwrap()).collect::<Vec<_>>(), &ctx).unwrap();
+        (mesh, p)
+    };
+    let ((one, p1), (three, p3)) = (mesh(1), mesh(3));
+    let bits = |m: &TriMesh| m.vertices.iter().flat_map(|p| p.to_array()).map(f64::to_bits).collect::<Vec<_>>();
+    assert_eq!(bits(&one), bits(&three));
+    assert_eq!((one.triangles, one.face_id, p1), (three.triangles, three.face_id, p3));
+}
+
+#[test]
+fn cancelled_work_says_so_everywhere() {
+    let ctx = Ctx::new(2).unwrap();
+    let field = fields::sphere(P3::ORIGIN, 2.0);
+    let seed = [P3::new(2.0, 0.0, 0.0)];
+    let (mut mesh, _) = polygonise(&field, &seed, &PolygoniseSettings::default(), &ctx).unwrap();
+    ctx.cancel();
+    assert_eq!(polygonise(&field, &seed, &PolygoniseSettings::default(), &ctx).unwrap_err(), Error::Cancelled);
+    assert_eq!(project(&mut mesh, &field, 0.5, &ctx).unwrap_err(), Error::Cancelled);
+    assert_eq!(remesh(&mesh, &field, &[], &RemeshSettings::default(), &ctx).unwrap_err(), Error::Cancelled);
+    assert_eq!(displacement(&mesh, &field, 0.5, &ctx).unwrap_err(), Error::Cancelled);
+    assert_eq!(quality(&mesh, &field, &ctx).unwrap_err().code(), "cancelled");
+}
+
+#[test]
+fn surfaces_without_a_seed_too_large_or_out_of_the_data_are_refused() {
+    let ctx = Ctx::new(1).unwrap();
+    let field = fields::sphere(P3::ORIGIN, 2.0);
+    let run = |field: &Analytic, seed: P3, max_cells: usize| {
+        let s = PolygoniseSettings { max_cells, ..PolygoniseSettings::default() };
+        polygonise(field, &[seed], &s, &ctx).unwrap_err().code()
+    };
+    assert_eq!(run(&field, P3::new(30.0, 0.0, 0.0), 1000), "surface.no_seed");
+    assert_eq!(run(&field, P3::new(2.0, 0.0, 0.0), 100), "surface.too_many_cells");
+    let open = Analytic { f: Box::new(|x: P3| (x.z(), V3::Z)), bounds: field.bounds };
+    assert_eq!(run(&open, P3::new(0.0, 0.0, 0.1), 100_000), "surface.leaves_data");
+    let cuts = [V3::X, -V3::X, V3::Y, -V3::Y, V3::Z].map(|n| CutPlane { point: P3::ORIGIN + n * 3.0, outward: n });
+    let bounded = Bounded::new(&open, &cuts, 1.0);
+    let (mesh, _) = polygonise(&bounded, &[P3::new(0.0, 0.0, 0.1)], &PolygoniseSettings::default(), &ctx).unwrap();
+    assert_eq!(topology(&mesh).unwrap().euler, 2);
+}
+
+#[test]
+fn defects_are_named() {
+    let tetrahedron = TriMesh {
+        vertices: vec![P3::ORIGIN, P3::new(1.0, 0.0, 0.0), P3::new(0.0, 1.0, 0.0), P3::new(0.0, 0.0, 1.0)],
+        triangles: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
+        face_id: vec![WALL; 4],
+    };
+    assert_eq!(check(&tetrahedron).unwrap(), Topology { euler: 2, components: 1, genus: 0 });
+    let broken = |change: fn(&mut TriMesh)| {
+        let mut m = tetrahedron.clone();
+        change(&mut m);
+        check(&m).unwrap_err().kind
+    };
+    let drop_one = |m: &mut TriMesh| {
+        m.triangles.pop();
+        m.face_id.pop();
+    };
+    assert_eq!(broken(drop_one), DefectKind::OpenEdge);
+    assert_eq!(broken(|m| m.triangles[0] = [0, 1, 2]), DefectKind::Orientation);
+    assert_eq!(broken(|m| m.triangles[0] = [0, 2, 2]), DefectKind::Degenerate);
+    assert_eq!(broken(|m| m.triangles[0] = [0, 2, 9]), DefectKind::BadIndex);
+    assert_eq!(broken(|m| m.triangles[0] = m.triangles[1]), DefectKind::Duplicate);
+    assert_eq!(broken(|m| m.vertices.push(P3::ORIGIN)), DefectKind::LooseVertex);
+    assert_eq!(broken(|m| m.vertices[3] = P3::new(1.0, 0.0, 0.0)), DefectKind::Degenerate);
+}
