@@ -133,7 +133,7 @@ fn one(
     let mut number = BTreeMap::new();
     for h in crossed {
         let v = clipped.mesh.vertices.len() as u32;
-        clipped.mesh.vertices.push(P3::from_raw(rim_vertex(&web, field, flats, (k, h), &height, v, report)?));
+        clipped.mesh.vertices.push(P3::from_raw(rim_vertex(&web, field, flats, (k, h), &height, report)?));
         number.insert(h, v);
     }
     let boundary = clipped.triangles(&web, &inside, &number);
@@ -220,7 +220,6 @@ fn rim_vertex(
     flats: &[Flat],
     (k, h): (usize, u32),
     height: &[f64],
-    vertex: u32,
     report: &mut CutReport,
 ) -> Result<DVec3, Error> {
     let (a, b) = (web.origin[h as usize] as usize, web.target(h) as usize);
@@ -244,7 +243,7 @@ fn rim_vertex(
         if sine < GRAZING || l.at.distance(start) > 3.0 * reach {
             return Err(grazing(sine, start));
         }
-        landed(vertex as usize, &l)?;
+        landed(a, &l)?;
     }
     Ok(l.at)
 }
@@ -333,7 +332,6 @@ mod tests {
             assert_eq!(r.vertices, mesh.vertices.len());
             assert_eq!(check(&mesh).unwrap().euler, 2);
             assert_eq!(crate::self_intersections(&mesh, &ctx).unwrap(), Vec::<[usize; 2]>::new());
-            eprintln!("{q:?}");
             assert!(q.min_angle_deg >= 30.0 && q.max_angle_deg <= 115.0, "{q:?}");
             for cap in &report.caps {
                 for (tri, _) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id == cap.face_id) {
@@ -358,7 +356,6 @@ mod tests {
         let (mesh, _) = remesh(&mesh, &field, &cuts, &s, &ctx).unwrap();
         assert_eq!(check(&mesh).unwrap().euler, 2);
         let q = quality(&mesh, &field, &ctx).unwrap();
-        eprintln!("{q:?}");
         assert!(q.vertex_max_mm <= 1e-9, "{q:?}");
     }
 
