@@ -350,6 +350,22 @@ mod tests {
     }
 
     #[test]
+    fn a_trifurcation_has_four_patches() {
+        let ctx = Ctx::new(2).unwrap();
+        let branches = [(V3::Z, 3.0), (-V3::Z, 3.0), (V3::new(0.8, 0.0, 0.6), 2.5), (V3::new(-0.6, 0.0, 0.8), 2.5)];
+        let field = fields::tree(branches.map(|(d, r)| (d, 24.0, r)).to_vec(), vec![1.5, 1.5, 1.5]);
+        // The side first: its branch's tip, which the upper plane would graze, is gone by then.
+        let mut cuts = vec![CutPlane { point: P3::new(15.0, 0.0, 0.0), outward: V3::X }];
+        cuts.extend(ends());
+        let (mesh, caps) = meshed(&field, &cuts, &ctx);
+        assert_eq!(caps, 4);
+        let p = patches(&mesh, &[3, 1, 2, 0], &ctx).unwrap();
+        // One of the four regions borders two others on separate curves: no annulus, and it says so.
+        assert_eq!(p.without_v, vec![0]);
+        assert!((0..4).all(|id| p.patch_id.contains(&id)));
+    }
+
+    #[test]
     fn a_closed_surface_is_one_patch() {
         let ctx = Ctx::new(1).unwrap();
         let field = fields::torus(6.0, 2.0);
