@@ -11,6 +11,8 @@
 //! are then ambiguous, and the Euler number of one grid-aligned tube in ten was wrong.
 
 use crate::cap::{Rim, close};
+use crate::fabric::Fabric;
+use crate::improve::{collapse_short, flip_to_valence};
 use crate::land::{Approach, Flat, Tie, land, landed};
 use crate::topology::regions;
 use crate::web::Web;
@@ -80,8 +82,7 @@ pub fn cut(mesh: &TriMesh, field: &dyn Field, cuts: &[CutPlane], ctx: &Ctx) -> R
     }
     let mut report = CutReport::default();
     // While cutting, the caps of plane k carry id k + 1.
-    let mut now = mesh.clone();
-    now.face_id.fill(WALL);
+    let mut now = tidy(mesh, field, ctx)?;
     for (k, _) in flats.iter().enumerate() {
         ctx.progress(k as f64 / flats.len() as f64);
         ctx.check()?;
@@ -99,6 +100,25 @@ pub fn cut(mesh: &TriMesh, field: &dyn Field, cuts: &[CutPlane], ctx: &Ctx) -> R
     report.caps = number(&mut now, &flats)?;
     ctx.progress(1.0);
     Ok((now, report))
+}
+
+/// The wall without its slivers: edges shorter than the mean collapse onto vertices that stay, no evaluation of f. On
+/// the slivers of a raw lattice mesh the rim of an oblique cut crosses itself (trifurcation of the tests, at .5 mm).
+fn tidy(mesh: &TriMesh, field: &dyn Field, ctx: &Ctx) -> Result<TriMesh, Error> {
+    let mut wall = mesh.clone();
+    wall.face_id.fill(WALL);
+    let mut fabric = Fabric::new(&wall, field, Vec::new())?;
+    for t in 0..wall.triangles.len() {
+        let normal = wall.area_vector(t).raw();
+        wall.triangles[t].iter().for_each(|&v| fabric.gradient[v as usize] -= normal);
+    }
+    let (sum, count) = fabric.edges().fold((0.0, 0_u32), |(s, n), h| (s + fabric.web.length(h), n + 1));
+    fabric.size.fill(sum / f64::from(count.max(1)));
+    for _ in 0..2 {
+        collapse_short(&mut fabric, ctx)?;
+        flip_to_valence(&mut fabric, ctx)?;
+    }
+    Ok(fabric.web.mesh())
 }
 
 /// Cut by plane k; `None` when nothing lies outside.
@@ -133,7 +153,7 @@ fn one(
     let mut number = BTreeMap::new();
     for h in crossed {
         let v = clipped.mesh.vertices.len() as u32;
-        clipped.mesh.vertices.push(P3::from_raw(rim_vertex(&web, field, flats, (k, h), &height, v, report)?));
+        clipped.mesh.vertices.push(P3::from_raw(rim_vertex(&web, field, flats, (k, h), &height, report)?));
         number.insert(h, v);
     }
     let boundary = clipped.triangles(&web, &inside, &number);
@@ -220,7 +240,6 @@ fn rim_vertex(
     flats: &[Flat],
     (k, h): (usize, u32),
     height: &[f64],
-    vertex: u32,
     report: &mut CutReport,
 ) -> Result<DVec3, Error> {
     let (a, b) = (web.origin[h as usize] as usize, web.target(h) as usize);
@@ -244,7 +263,7 @@ fn rim_vertex(
         if sine < GRAZING || l.at.distance(start) > 3.0 * reach {
             return Err(grazing(sine, start));
         }
-        landed(vertex as usize, &l)?;
+        landed(a, &l)?;
     }
     Ok(l.at)
 }
@@ -333,7 +352,6 @@ mod tests {
             assert_eq!(r.vertices, mesh.vertices.len());
             assert_eq!(check(&mesh).unwrap().euler, 2);
             assert_eq!(crate::self_intersections(&mesh, &ctx).unwrap(), Vec::<[usize; 2]>::new());
-            eprintln!("{q:?}");
             assert!(q.min_angle_deg >= 30.0 && q.max_angle_deg <= 115.0, "{q:?}");
             for cap in &report.caps {
                 for (tri, _) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id == cap.face_id) {
@@ -358,7 +376,6 @@ mod tests {
         let (mesh, _) = remesh(&mesh, &field, &cuts, &s, &ctx).unwrap();
         assert_eq!(check(&mesh).unwrap().euler, 2);
         let q = quality(&mesh, &field, &ctx).unwrap();
-        eprintln!("{q:?}");
         assert!(q.vertex_max_mm <= 1e-9, "{q:?}");
     }
 

@@ -67,6 +67,17 @@ pub enum Error {
         /// Where.
         at: P3,
     },
+    /// A triangle faces against the surface after remeshing.
+    #[error(
+        "triangle {face} is folded over: the wall is curved more sharply than the shortest edge; \
+         lower the shortest surface.edge_mm or smooth the fit more"
+    )]
+    Folded {
+        /// Triangle number.
+        face: usize,
+        /// Where.
+        at: P3,
+    },
     /// The mesh is not a closed oriented 2-manifold.
     #[error("the surface mesh is broken: {0}")]
     Defect(#[from] Defect),
@@ -174,6 +185,7 @@ impl Faulty for Error {
             Self::LeavesData { .. } => "surface.leaves_data",
             Self::NotFinite { .. } => "surface.not_finite",
             Self::Projection { .. } => "surface.projection",
+            Self::Folded { .. } => "surface.folded",
             Self::Defect(_) => "surface.defect",
             Self::GrazingCut { .. } => "surface.grazing_cut",
             Self::NestedRims { .. } => "surface.nested_rims",
@@ -197,6 +209,7 @@ impl Faulty for Error {
             | Self::CapPlane { at, .. }
             | Self::TooManyTriangles { at, .. } => Place::at(*at),
             Self::Projection { vertex, at, .. } => Place { element: Some(*vertex), ..Place::at(*at) },
+            Self::Folded { face, at } => Place { element: Some(*face), ..Place::at(*at) },
             Self::Defect(d) => Place { element: Some(d.element), ..Place::at(d.at) },
             Self::Settings { field, .. } => Place::field(format!("surface.{field}")),
             _ => Place::none(),

@@ -1,7 +1,9 @@
 //! The implicit function to triangles: polygonise, project, cut and cap, remesh, distances, patches, checks.
 //!
-//! f = 0 on the wall, f > 0 in the lumen. The usual way: [`polygonise`] from the contour points, [`project`], [`cut`]
-//! by the planes at which the data end, [`remesh`], then [`check`], [`quality`], [`displacement`] and [`patches`].
+//! f = 0 on the wall, f > 0 in the lumen. The usual way: [`polygonise`] of the field [`Bounded`] by the planes at which
+//! the data end, from the contour points; [`cut`] of the raw mesh by those planes, with the field itself; [`remesh`] with
+//! the planes, which lands every wall vertex on f = 0; then [`check`], [`self_intersections`], [`quality`],
+//! [`displacement`] and [`patches`]. [`project`] is for those who want the raw mesh on f = 0 without remeshing.
 
 mod cap;
 mod cut;

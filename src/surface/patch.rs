@@ -121,8 +121,7 @@ fn grown(mesh: &TriMesh, web: &Web, largest: &[usize], rim: &[Option<usize>]) ->
         }
     }
     let mut later = VecDeque::new();
-    loop {
-        let Some(t) = open.pop_front().or_else(|| later.pop_front()) else { break };
+    while let Some(t) = open.pop_front().or_else(|| later.pop_front()) {
         for h in 3 * t..3 * t + 3 {
             let o = web.twin[h] as usize / 3;
             if mesh.face_id[o] != WALL || label[o] != usize::MAX {
@@ -131,7 +130,7 @@ fn grown(mesh: &TriMesh, web: &Web, largest: &[usize], rim: &[Option<usize>]) ->
             if largest[o] == label[t] {
                 label[o] = label[t];
                 open.push_back(o);
-            } else if !later.contains(&t) {
+            } else if later.back() != Some(&t) {
                 later.push_back(t);
             }
         }
@@ -295,7 +294,10 @@ mod tests {
     use space::{P3, V3};
 
     fn meshed(field: &fields::Analytic, cuts: &[CutPlane], ctx: &Ctx) -> (TriMesh, usize) {
-        let (raw, _) = polygonise(field, &[fields::tips()[0]], &PolygoniseSettings::default(), ctx).unwrap();
+        // The way of the pipeline: closed a little outside the planes, cut raw, landed by the remeshing.
+        let bounded = crate::Bounded::new(field, cuts, 2.0);
+        let seed = [P3::new(-3.0, 0.0, 12.0)];
+        let (raw, _) = polygonise(&bounded, &seed, &PolygoniseSettings::default(), ctx).unwrap();
         let (mesh, report) = cut(&raw, field, cuts, ctx).unwrap();
         let s = RemeshSettings { sizing: Sizing::Uniform(0.6), ..RemeshSettings::default() };
         (remesh(&mesh, field, cuts, &s, ctx).unwrap().0, report.caps.len())
@@ -345,6 +347,22 @@ mod tests {
         let (mesh, caps) = meshed(&fields::anastomosis(), &ends(), &ctx);
         assert_eq!(caps, 3);
         sound(&patches(&mesh, &[0, 1, 2], &ctx).unwrap(), &mesh);
+    }
+
+    #[test]
+    fn a_trifurcation_has_four_patches() {
+        let ctx = Ctx::new(2).unwrap();
+        let branches = [(V3::Z, 3.0), (-V3::Z, 3.0), (V3::new(0.8, 0.0, 0.6), 2.5), (V3::new(-0.6, 0.0, 0.8), 2.5)];
+        let field = fields::tree(branches.map(|(d, r)| (d, 24.0, r)).to_vec(), vec![1.5, 1.5, 1.5]);
+        // The side first: its branch's tip, which the upper plane would graze, is gone by then.
+        let mut cuts = vec![CutPlane { point: P3::new(15.0, 0.0, 0.0), outward: V3::X }];
+        cuts.extend(ends());
+        let (mesh, caps) = meshed(&field, &cuts, &ctx);
+        assert_eq!(caps, 4);
+        let p = patches(&mesh, &[3, 1, 2, 0], &ctx).unwrap();
+        // One of the four regions borders two others on separate curves: no annulus, and it says so.
+        assert_eq!(p.without_v, vec![0]);
+        assert!((0..4).all(|id| p.patch_id.contains(&id)));
     }
 
     #[test]

@@ -82,11 +82,12 @@ const CAP_SLACK_MM: f64 = 1e-6;
 /// `cuts` are the planes by which the caps were cut, in any order (each cap takes the one that it lies in). The result
 /// is closed and 2-manifold like the input; wall and rim vertices have |f| / |grad f| <= 1e-9 mm, caps stay planar, rims
 /// stay rims, face ids stay. Not promised: the goal angle (see the report), and |distance| <= `max_error_mm` where
-/// `edge_mm` forbids it. Cost: about ten calls of (f, grad f) per vertex.
+/// `edge_mm` forbids it. Cost: about 18 calls of (f, grad f) per vertex at
+/// the default number of rounds, and by curvature 5 with second derivatives.
 ///
 /// # Errors
 /// [`Error::Defect`] for an open or broken mesh, [`Error::CapPlane`], [`Error::TooManyTriangles`],
-/// [`Error::Projection`], [`Error::NotFinite`], [`Error::Settings`], [`Error::Cancelled`].
+/// [`Error::Projection`], [`Error::Folded`], [`Error::NotFinite`], [`Error::Settings`], [`Error::Cancelled`].
 pub fn remesh(
     mesh: &TriMesh,
     field: &dyn Field,
@@ -138,6 +139,10 @@ fn finish(mut fabric: Fabric<'_>, mended: usize, longest: f64, ctx: &Ctx) -> Res
     for t in 0..fabric.web.face_id.len() {
         let w = fabric.worth_at(3 * t as u32);
         report.min_angle_deg = report.min_angle_deg.min(w.angle.to_degrees());
+        if w.facing <= 0.0 {
+            let at = P3::from_raw(fabric.web.at[fabric.web.origin[3 * t] as usize]);
+            return Err(Error::Folded { face: t, at });
+        }
         report.min_facing = report.min_facing.min(w.facing);
     }
     crate::quality::wall_landed(&fabric, &all, ctx)?;
@@ -216,8 +221,7 @@ mod tests {
         let s = RemeshSettings { sizing: Sizing::Uniform(0.485), ..RemeshSettings::default() };
         let (mesh, report) = remesh(&mesh, &field, &[], &s, &ctx).unwrap();
         let q = quality(&mesh, &field, &ctx).unwrap();
-        eprintln!("{} triangles, {report:?}\n{q:?}", mesh.triangles.len());
-        assert_eq!(check(&mesh).unwrap().euler, 2);
+        assert_eq!((check(&mesh).unwrap().euler, report.vertices), (2, mesh.vertices.len()));
         assert!(q.min_angle_deg >= 33.0 && q.max_angle_deg <= 110.0, "{q:?}");
         assert!(q.face_rms_mm <= 5.5e-3 && q.vertex_max_mm <= 1e-9, "{q:?}");
     }
@@ -229,9 +233,8 @@ mod tests {
         let mesh = raw(&field, fields::tips()[0], 0.5, &ctx);
         let (mesh, report) = remesh(&mesh, &field, &[], &RemeshSettings::default(), &ctx).unwrap();
         let q = quality(&mesh, &field, &ctx).unwrap();
-        eprintln!("{} triangles, {report:?}\n{q:?}", mesh.triangles.len());
-        assert_eq!(check(&mesh).unwrap().euler, 2);
+        assert_eq!((check(&mesh).unwrap().euler, report.vertices), (2, mesh.vertices.len()));
         assert!(q.min_angle_deg >= 30.0 && q.max_angle_deg <= 115.0, "{q:?}");
-        assert!(q.face_max_mm <= 0.025 && q.vertex_max_mm <= 1e-9, "{q:?}");
+        assert!(q.face_max_mm <= 0.02 && mesh.triangles.len() <= 30_000 && q.vertex_max_mm <= 1e-9, "{q:?}");
     }
 }

@@ -35,15 +35,15 @@ pub(crate) fn harmonic(
     let mut b = vec![0.0; n];
     for &t in triangles {
         let (w, c) = (half_cotangents(mesh, t), mesh.triangles[t]);
-        for k in 0..3 {
+        for (k, &weight) in w.iter().enumerate() {
             let (ki, kj) = ((k + 1) % 3, (k + 2) % 3);
             for (ki, kj) in [(ki, kj), (kj, ki)] {
                 let (i, j) = (c[ki] as usize, c[kj] as usize);
-                diagonal[i] += w[k];
-                b[i] += w[k] * (jump(t, kj) - jump(t, ki));
+                diagonal[i] += weight;
+                b[i] += weight * (jump(t, kj) - jump(t, ki));
                 match given[j] {
-                    Some(x) => b[i] += w[k] * x,
-                    None => row[i].push((c[kj], -w[k])),
+                    Some(x) => b[i] += weight * x,
+                    None => row[i].push((c[kj], -weight)),
                 }
             }
         }
