@@ -14,13 +14,14 @@ use crate::types::Helix;
 
 /// A branch that bends by less than this in all, radians, is as good as straight: its plane of bending, and with it
 /// the torsion, is not told by points with an error of a hundredth of the radius.
-pub const BEND_MIN: f64 = 0.35;
-/// The sagitta k L^2 / 8 must exceed the residual by this factor.
-pub const SAGITTA_RATIO: f64 = 6.0;
+const BEND_MIN: f64 = 0.35;
+/// The points must lie this many times further (root mean square) from the best straight line than from the helix. A
+/// short line of pure noise reaches 1.4, because a tight helix follows some of it.
+const STRAIGHT_RATIO: f64 = 3.0;
 /// Fewest points.
-pub const POINTS_MIN: usize = 12;
+const POINTS_MIN: usize = 12;
 /// Largest standard error of the torsion, in units of sqrt(k^2 + t^2).
-pub const TORSION_ERROR_MAX: f64 = 0.2;
+const TORSION_ERROR_MAX: f64 = 0.2;
 
 const FREE: usize = 7;
 
@@ -136,7 +137,7 @@ impl State {
 }
 
 /// The helix nearest to the points of one branch, in order along it; `None` when the branch has fewer than 12 points,
-/// bends by less than .35 rad in all, has a sagitta below 6 times the residual, or leaves the torsion uncertain by more
+/// bends by less than .35 rad in all, is not 3 times nearer to the helix than to a straight line, or leaves the torsion uncertain by more
 /// than a fifth of sqrt(k^2 + t^2). Cost: some tens of passes, each 15 curve points per sample.
 pub fn fit_helix(points: &[P3]) -> Option<Helix> {
     if points.len() < POINTS_MIN {
@@ -160,7 +161,7 @@ pub fn fit_helix(points: &[P3]) -> Option<Helix> {
         }
     }
     let (_, state, weight) = best?;
-    report(&state, &weight, length)
+    report(&state, &weight, &points, length)
 }
 
 /// Natural units of the seven parameters for a line of some length, which make the normal matrix well scaled.
@@ -237,11 +238,21 @@ fn start(points: &[DVec3], s: &[f64]) -> Option<(Curve, f64)> {
     w.is_finite().then_some((curve, s[n / 2]))
 }
 
-fn report(state: &State, weight: &[f64], length: f64) -> Option<Helix> {
+/// Root mean square distance of weighted points from their best straight line.
+fn straight_rms(points: &[DVec3], weight: &[f64]) -> f64 {
+    let total: f64 = weight.iter().sum();
+    let weighted = points.iter().zip(weight);
+    let mean = weighted.clone().fold(DVec3::ZERO, |m, (p, w)| m + *p * *w) / total;
+    let spread = weighted.fold(DMat3::ZERO, |m, (p, w)| m + crate::linear::outer(*p - mean, w / total));
+    let [(a, _), (b, _), _] = crate::linear::eigen3(spread);
+    (a + b).max(0.0).sqrt()
+}
+
+fn report(state: &State, weight: &[f64], points: &[DVec3], length: f64) -> Option<Helix> {
     let (k, t) = (state.curve.curvature.abs(), state.curve.torsion);
     let total: f64 = weight.iter().sum();
     let rms = (state.cost(weight) / total).sqrt();
-    if k * length < BEND_MIN || k * length * length / 8.0 < SAGITTA_RATIO * rms {
+    if k * length < BEND_MIN || straight_rms(points, weight) < STRAIGHT_RATIO * rms {
         return None;
     }
     let unit = units(length);

@@ -17,6 +17,9 @@ pub(crate) const WINDOW_MIN: f64 = 1.0;
 /// Where the crotch reaches so far that the wanted window is shorter than this, its end is moved out.
 const WINDOW_WANTED: f64 = 1.5;
 
+/// Axes that meet further than this many (largest) radii from the graph's node do not belong to one junction's lumens.
+const STRAY_RADII: f64 = 4.0;
+
 /// An edge seen from one of its ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Leg {
@@ -180,10 +183,11 @@ pub(crate) fn chord(samples: &[LegSample], origin: DVec3, radius: f64) -> Option
 pub(crate) fn axes(tracks: &[Track], legs: &[Leg], node: P3, node_radius: f64, ruler: Ruler) -> Axes {
     const TURNS: usize = 100;
     let radii: Vec<f64> = legs.iter().map(|&l| leg_radius(&tracks[l.track], l, node_radius)).collect();
+    let largest = radii.iter().copied().fold(node_radius, f64::max);
     let mut axes = Axes {
         point: None,
         origin: node.raw(),
-        crotch: 1.5 * radii.iter().copied().fold(node_radius, f64::max),
+        crotch: 1.5 * largest,
         windows: Vec::new(),
         moved: false,
         settled: false,
@@ -191,7 +195,7 @@ pub(crate) fn axes(tracks: &[Track], legs: &[Leg], node: P3, node_radius: f64, r
     for turn in 0..TURNS {
         let (windows, moved, crotch) = turn_of(tracks, legs, &radii, &axes, ruler);
         let lines: Vec<FittedLine> = windows.iter().filter_map(|w| w.1.line).collect();
-        let point = meeting_point(&lines);
+        let point = meeting_point(&lines).filter(|p| p.distance(node) <= STRAY_RADII * largest);
         let (origin, still) = {
             let target = point.map_or(node.raw(), P3::raw);
             // the first turns go all the way, later ones halfway, which stops a swing between two states

@@ -267,24 +267,42 @@ fn track(graph: &MedialGraph, id: usize) -> Result<Track, Error> {
         radius.reverse();
         (from, to) = (to, from);
     }
-    let s = arc_length(&points);
-    let length = s[s.len() - 1];
     let typical = median(radius.clone()).unwrap_or(0.0);
-    if !(length > 0.0) || !(typical > 0.0) {
+    if !(arc_length(&points)[points.len() - 1] > 0.0) || !(typical > 0.0) {
         return Err(bad("no length or no radius"));
     }
+    // sampled and smoothed twice: kinks, which lengthen the line and crowd its samples, are gone in the second round
+    let (at, sampled) = even(&points, &radius, typical);
+    let once = local_positions(&at, &sampled);
+    let (at, sampled) = even(&once, &sampled.iter().map(|p| p.1).collect::<Vec<_>>(), typical);
+    let tip = [from, to].map(|n| kind(n) == NodeKind::End && graph.nodes[n].cap.is_none());
+    Ok(smoothed(id, [from, to], tip, &at, &sampled))
+}
+
+/// Points and radii at even arc lengths.
+fn even(points: &[DVec3], radius: &[f64], typical: f64) -> (Vec<f64>, Vec<(DVec3, f64)>) {
+    let s = arc_length(points);
+    let length = s[s.len() - 1];
     let step = (STEP_RADII * typical).clamp(length / SECTIONS_MAX, STEP_MAX_MM.max(length / SECTIONS_MAX));
     let count = ((length / step).ceil() as usize).max(4);
     let at: Vec<f64> = (0..=count).map(|k| length * k as f64 / count as f64).collect();
-    let sampled: Vec<(DVec3, f64)> = at
+    let sampled = at
         .iter()
         .map(|&at| {
             let (i, t) = locate(&s, at);
             (points[i].lerp(points[i + 1], t), radius[i] + (radius[i + 1] - radius[i]) * t)
         })
         .collect();
-    let tip = [from, to].map(|n| kind(n) == NodeKind::End && graph.nodes[n].cap.is_none());
-    Ok(smoothed(id, [from, to], tip, &at, &sampled))
+    (at, sampled)
+}
+
+fn local_positions(at: &[f64], sampled: &[(DVec3, f64)]) -> Vec<DVec3> {
+    let raw: Vec<DVec3> = sampled.iter().map(|p| p.0).collect();
+    let ones = vec![1.0; raw.len()];
+    let line = Samples { s: at, points: &raw, weight: &ones };
+    let half = |r: f64| (SMOOTH_RADII * r).max(5.0 * (at[1] - at[0]));
+    let fit = |k: usize| line.local::<3>(at[k], half(sampled[k].1)).map_or(raw[k], |f| f.position);
+    (0..raw.len()).map(fit).collect()
 }
 
 fn smoothed(id: usize, nodes: [usize; 2], tip: [bool; 2], at: &[f64], sampled: &[(DVec3, f64)]) -> Track {
