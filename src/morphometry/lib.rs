@@ -1,5 +1,25 @@
 //! The medial line to numbers: branches, reference plane, angles, sections, helix.
+//!
+//! [`measure`] is the whole; its stages are public for tests and studies.
 
+mod angle;
+mod error;
+mod fit;
+mod helix;
+mod junction;
+mod line;
+mod linear;
+mod measure;
+mod roles;
+mod section;
+mod track;
 mod types;
 
+pub use angle::{Undefined, plane_normal};
+pub use error::Error;
+pub use fit::{FittedLine, fit_line, meeting_point};
+pub use helix::fit_helix;
+pub use junction::crotch_distance;
+pub use measure::measure;
+pub use section::{Cut, Lumen, Outline, RAYS};
 pub use types::{Angle, Branch, ByDistance, Helix, Junction, Morphometry, Role, Roles, Section, Settings, VmtkAngles};
