@@ -49,10 +49,8 @@ pub(crate) fn implicit(r: &implicit::FitReport) -> ImplicitFacts {
     }
 }
 
-pub(crate) fn surface(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceFacts {
+pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceFacts {
     let d = &wall.displacement;
-    let pixel = |mm: f64, px: f64| if px == 0.0 { 0.0 } else { mm / px };
-    let mm_per_px = d.mm.iter().zip(&d.px).map(|(&mm, &px)| pixel(mm, px)).find(|s| *s > 0.0).unwrap_or(0.0);
     SurfaceFacts {
         min_angle_deg: wall.quality.min_angle_deg,
         max_angle_deg: wall.quality.max_angle_deg,
@@ -62,8 +60,8 @@ pub(crate) fn surface(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometr
         max_error_mm: wall.quality.face_max_mm,
         area_mm2: wall.mesh.area(),
         volume_mm3: wall.mesh.volume(),
-        displacement_px: Range { min: d.min_px, max: d.max_px, rms: d.rms_px },
-        displacement_mm: Range { min: d.min_px * mm_per_px, max: d.max_px * mm_per_px, rms: d.rms_px * mm_per_px },
+        displacement_px: Range { min: d.min_mm / pixel_mm, max: d.max_mm / pixel_mm, rms: d.rms_mm / pixel_mm },
+        displacement_mm: Range { min: d.min_mm, max: d.max_mm, rms: d.rms_mm },
         caps: wall.caps.iter().map(|c| cap(c, graph, morphometry)).collect(),
     }
 }

@@ -9,13 +9,13 @@ use artefact::write::{self, NamedBytes, Provenance};
 use artefact::{Reconstruction, reconstruction::SurfaceData};
 use exec::Ctx;
 use imaging::{Contours, Stack};
-use implicit::{Field, Sampled, Smoothing, Variational};
+use implicit::{Sampled, Smoothing, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
 use space::{FaultKind, P3, Warning};
 use std::path::{Path, PathBuf};
-use surface::{Displacement, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh};
+use surface::{Bounded, Displacement, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh};
 
 /// The surface with all that is known of it.
 pub(crate) struct Wall {
@@ -70,7 +70,7 @@ fn reconstruct(
             segmentation: facts::segmentation(&contours, &segmentation),
             contours: &contours,
             implicit: facts::implicit(&fit),
-            surface: surface_data(&wall, &graph, &morphometry),
+            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry),
             graph: &graph,
             morphometry: &morphometry,
             warnings: &warnings,
@@ -161,8 +161,8 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
             break;
         };
         let wall = mesh_of(&field, f, contours, plan, &ctx.part(0.3, 1.0))?;
-        let moved = wall.displacement.min_px.abs().max(wall.displacement.max_px.abs());
-        if moved <= image.smoothing.max_displacement_px {
+        let moved = wall.displacement.min_mm.abs().max(wall.displacement.max_mm.abs());
+        if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
             return Ok(wall);
         }
         limit = report.sigma_mm * RETREAT;
@@ -172,7 +172,9 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
 
 fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
     let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
-    let (rough, _) = surface::polygonise(field, f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+    // the function past the data's ends means nothing: close it just outside the cuts
+    let bounded = Bounded::new(field, &contours.cuts, 4.0 * contours.pixel_mm);
+    let (rough, _) = surface::polygonise(&bounded, f.wall(), &cell, &ctx.part(0.0, 0.1))?;
     let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
     let settings = RemeshSettings {
         edge_mm: plan.surface.edge_mm,
@@ -184,7 +186,8 @@ fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, c
     let topology = surface::check(&mesh).map_err(surface::Error::from)?;
     let quality = surface::quality(&mesh, field, ctx)?;
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
-    let patches = surface::patches(&mesh, ctx)?;
+    let ids: Vec<u32> = (0..report.caps.len() as u32).collect();
+    let patches = surface::patches(&mesh, &ids, ctx)?;
     Ok(Wall { mesh, caps: report.caps, topology, quality, displacement, patches })
 }
 
@@ -235,10 +238,10 @@ fn medial_lines(
     skeleton::medial_graph(sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), ctx)
 }
 
-fn surface_data<'a>(wall: &'a Wall, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceData<'a> {
+fn surface_data<'a>(wall: &'a Wall, pixel_mm: f64, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceData<'a> {
     SurfaceData {
         mesh: &wall.mesh,
-        quality: facts::surface(wall, graph, morphometry),
+        quality: facts::surface(wall, pixel_mm, graph, morphometry),
         displacement_mm: &wall.displacement.mm,
         displacement_px: &wall.displacement.px,
         patches: Some(facts::patches(&wall.patches)),

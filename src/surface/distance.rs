@@ -1,7 +1,7 @@
 //! How far the final surface lies from a reference surface (the fit before smoothing), signed.
 
 use crate::land::{Approach, Tie, land};
-use crate::{Error, TriMesh};
+use crate::{Error, TriMesh, WALL};
 use exec::Ctx;
 use glam::DVec3;
 use implicit::Field;
@@ -34,6 +34,8 @@ const STILL_MM: f64 = 1e-7;
 /// The signed distance of every vertex of `mesh` to the zero set of `reference`, positive where the vertex lies outside
 /// (f < 0 there), in mm and in pixels of `pixel_mm`.
 ///
+/// A vertex inside a cap is no part of the wall: its displacement is 0 and does not count.
+///
 /// The foot point is found by Hartmann's iteration (1999): land on f = 0 along the gradient, step within the tangent
 /// plane towards the vertex, repeat. It is the nearest point when the vertex is nearer than the radius of curvature.
 ///
@@ -43,7 +45,11 @@ pub fn displacement(mesh: &TriMesh, reference: &dyn Field, pixel_mm: f64, ctx: &
     if !(pixel_mm.is_finite() && pixel_mm > 0.0) {
         return Err(Error::Settings { field: "pixel_mm", value: pixel_mm, need: "a positive length" });
     }
-    let feet = ctx.map(&mesh.vertices, |p| foot(reference, p.raw(), pixel_mm))?;
+    let wall = wall_vertices(mesh);
+    let feet = ctx.map_range(mesh.vertices.len(), |v| match wall[v] {
+        true => foot(reference, mesh.vertices[v].raw(), pixel_mm),
+        false => Foot { mm: 0.0, found: true, evaluations: 0 },
+    })?;
     let mut d = Displacement { min_mm: f64::INFINITY, max_mm: f64::NEG_INFINITY, ..Displacement::default() };
     for (foot, &at) in feet.iter().zip(&mesh.vertices) {
         if !foot.mm.is_finite() {
@@ -60,9 +66,21 @@ pub fn displacement(mesh: &TriMesh, reference: &dyn Field, pixel_mm: f64, ctx: &
     if d.mm.is_empty() {
         return Ok(Displacement::default());
     }
-    d.rms_mm = (d.rms_mm / d.mm.len() as f64).sqrt();
+    d.rms_mm = (d.rms_mm / wall.iter().filter(|w| **w).count().max(1) as f64).sqrt();
     ctx.progress(1.0);
     Ok(d)
+}
+
+/// Vertices that are not strictly inside a cap.
+fn wall_vertices(mesh: &TriMesh) -> Vec<bool> {
+    let mut touches = vec![(false, false); mesh.vertices.len()];
+    for (t, &id) in mesh.triangles.iter().zip(&mesh.face_id) {
+        for &v in t {
+            let touch = &mut touches[v as usize];
+            if id == WALL { touch.0 = true } else { touch.1 = true }
+        }
+    }
+    touches.into_iter().map(|(wall, cap)| wall || !cap).collect()
 }
 
 struct Foot {
