@@ -96,7 +96,8 @@ async fn create(
     let key = idempotency_key(&headers)?;
     let upload = multipart::read(&state, form).await?;
     let files = intake(&state.config, upload.files).await?;
-    let (input, files) = tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
+    let (input, files) =
+        tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
     let id = Uuid::now_v7();
     let bytes: u64 = input.files.iter().map(|f| f.bytes).sum();
     let job = NewJob {
@@ -196,7 +197,8 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
 /// `Prefer: wait=N` (RFC 7240).
 fn preferred_wait(headers: &HeaderMap) -> Option<Duration> {
     let prefers = headers.get_all("prefer").iter().filter_map(|v| v.to_str().ok()).flat_map(|v| v.split([',', ';']));
-    let seconds = prefers.filter_map(|p| p.trim().strip_prefix("wait=")?.trim_matches('"').parse::<u64>().ok()).next()?;
+    let seconds =
+        prefers.filter_map(|p| p.trim().strip_prefix("wait=")?.trim_matches('"').parse::<u64>().ok()).next()?;
     Some(Duration::from_secs(seconds.min(LONGEST_WAIT)))
 }
 

@@ -101,7 +101,8 @@ async fn every_error_is_a_problem() {
 async fn a_trace_goes_through() {
     let service = Service::start().await;
     let trace = "4bf92f3577b34da6a3ce929d0e0e4736";
-    let request = service.request(Method::GET, "/nowhere").header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"));
+    let request =
+        service.request(Method::GET, "/nowhere").header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"));
     assert_eq!(request.send().await.unwrap().headers()["x-trace-id"], trace);
     service.stop().await;
 }
