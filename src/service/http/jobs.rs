@@ -70,7 +70,7 @@ struct SubmitForm {
 }
 
 /// Sends a scan and makes a job. A 202 is given once the job is durable.
-#[utoipa::path(post, path = "/v1/jobs", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs", operation_id = "create_job", tag = "jobs", security(("key" = [])),
     params(
         ("Idempotency-Key" = Option<String>, Header, description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
@@ -255,7 +255,7 @@ struct Listing {
 }
 
 /// Lists jobs, newest first.
-#[utoipa::path(get, path = "/v1/jobs", tag = "jobs", security(("key" = [])), params(Listing), responses(
+#[utoipa::path(get, path = "/v1/jobs", operation_id = "list_jobs", tag = "jobs", security(("key" = [])), params(Listing), responses(
     (status = 200, description = "A page; `Link: rel=next` and `next` lead to the next one", body = JobList),
     (status = 400, description = "The query cannot be understood", body = Problem, content_type = "application/problem+json")
 ))]
@@ -291,7 +291,7 @@ struct Waiting {
 }
 
 /// Reads a job.
-#[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}", operation_id = "read_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), Waiting,
         ("If-None-Match" = Option<String>, Header, description = "ETag seen before")),
     responses(
@@ -323,7 +323,7 @@ fn tag(row: &JobRow) -> String {
 }
 
 /// Cancels a job. A queued one ends at once, a running one within two seconds; its scan is erased.
-#[utoipa::path(post, path = "/v1/jobs/{id}/cancel", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs/{id}/cancel", operation_id = "cancel_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 200, description = "Cancelled", body = Job),
         (status = 202, description = "The worker was told", body = Job),
@@ -348,7 +348,7 @@ async fn cancel(Shared(state): Shared<State>, who: Principal, Path(id): Path<Str
 }
 
 /// Puts a failed job back into the queue with all its attempts.
-#[utoipa::path(post, path = "/v1/jobs/{id}/retry", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs/{id}/retry", operation_id = "retry_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 202, description = "Queued again", body = Job),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
@@ -370,7 +370,7 @@ async fn retry(Shared(state): Shared<State>, who: Principal, Path(id): Path<Stri
 }
 
 /// Erases a job with its scan, events and artefacts; a running one is cancelled first.
-#[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", security(("key" = [])),
+#[utoipa::path(delete, path = "/v1/jobs/{id}", operation_id = "erase_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 204, description = "Erased"),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json")

@@ -51,5 +51,10 @@ export function h(name, attributes = {}, ...children) {
 }
 
 export const bytes = (n) => (n < 1024 ? `${n} B` : n < 1048576 ? `${(n / 1024).toFixed(1)} kB` : `${(n / 1048576).toFixed(1)} MB`);
+export const count = (n, one, many) => `${n} ${n === 1 ? one : many}`;
+export const place = (where) => {
+  const parts = Object.entries(where ?? {}).map(([key, value]) => `${key} ${Array.isArray(value) ? value.join(", ") : value}`);
+  return parts.length > 0 ? ` (${parts.join(", ")})` : "";
+};
 export const when = (text) => (text ? new Date(text).toLocaleString() : "–");
 export const number = (x, digits = 1) => (typeof x === "number" && Number.isFinite(x) ? x.toFixed(digits) : "–");

@@ -1,5 +1,5 @@
 // The page: signing in, sending, the live queue, and the way to a job (#/jobs/ID).
-import { bytes, call, Fault, h, json, send, when } from "./api.js";
+import { bytes, call, count, Fault, h, json, send, when } from "./api.js";
 import { showJob } from "./job.js";
 
 const $ = (id) => document.getElementById(id);
@@ -19,6 +19,8 @@ function notice(error) {
 
 async function signIn(key) {
   await call("/v1/session", { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ key }) });
+  // The cookie itself cannot be read here: remember only that there is one.
+  localStorage.setItem("session", "yes");
   $("sign-out").hidden = false;
 }
 
@@ -110,7 +112,7 @@ function row(job) {
 
 function choose(list) {
   const files = [...list];
-  $("chosen").textContent = files.length === 0 ? "" : `${files.length} files, ${bytes(files.reduce((n, f) => n + f.size, 0))}`;
+  $("chosen").textContent = files.length === 0 ? "" : `${count(files.length, "file", "files")}, ${bytes(files.reduce((n, f) => n + f.size, 0))}`;
   return files;
 }
 
@@ -163,11 +165,13 @@ $("sign-in").querySelector("form").addEventListener("submit", async (e) => {
 $("sign-out").addEventListener("click", async () => {
   await call("/v1/session", { method: "DELETE" }).catch(notice);
   leave.abort();
+  localStorage.removeItem("session");
   $("sign-out").hidden = true;
   show("sign-in");
 });
 $("older").addEventListener("click", () => { pages += 1; });
 window.addEventListener("signed-out", () => show("sign-in"));
 window.addEventListener("hashchange", route);
+$("sign-out").hidden = localStorage.getItem("session") !== "yes";
 prepareSending();
 route();

@@ -1,5 +1,5 @@
 // One job's page: what happens, what was found, what to download.
-import { bytes, call, h, json, number, when } from "./api.js";
+import { bytes, call, count, h, json, number, place, when } from "./api.js";
 import { plot } from "./plot.js";
 
 const FINAL = ["succeeded", "failed", "cancelled"];
@@ -19,7 +19,7 @@ export async function showJob(box, id, signal, notice) {
   const redraw = () => !signal.aborted && draw(box, job, address, notice, signal);
   redraw();
   while (!signal.aborted && !FINAL.includes(job.state)) {
-    // The long poll answers at every change because of the ETag.
+    // The stream ends with the job; a broken one is taken up again.
     await follow(address, signal, (progress) => {
       Object.assign(job, progress);
       const state = box.querySelector("#job-state");
@@ -82,14 +82,14 @@ function actions(job, address, notice) {
 
 function draw(box, job, address, notice, signal) {
   const title = h("div", { class: "title" }, h("h1", {}, `Job ${job.id}`), h("span", { id: "job-state" }, stateLine(job)), actions(job, address, notice));
-  const facts = h("p", {}, `Sent ${when(job.created_at)} · ${job.input.files} files, ${bytes(job.input.bytes)} · attempt ${job.attempt} of ${job.max_attempts}`);
+  const facts = h("p", {}, `Sent ${when(job.created_at)} · ${count(job.input.files, "file", "files")}, ${bytes(job.input.bytes)} · attempt ${job.attempt} of ${job.max_attempts}`);
   box.replaceChildren(title, facts);
   if (job.error) box.append(fault(job.error));
   if (job.state === "succeeded") result(box, address, signal).catch(notice);
 }
 
 function fault(problem) {
-  const rows = (problem.errors ?? []).map((e) => h("li", {}, h("code", {}, e.code ?? ""), ` ${e.message ?? ""} ${e.where && Object.keys(e.where).length > 0 ? JSON.stringify(e.where) : ""}`));
+  const rows = (problem.errors ?? []).map((e) => h("li", {}, h("code", {}, e.code ?? ""), ` ${e.message ?? ""}${place(e.where)}`));
   return h("section", { class: "card fault" }, h("h2", {}, "Why it failed"), h("p", {}, h("code", {}, problem.code), ` ${problem.detail}`), h("ul", {}, rows));
 }
 
@@ -110,9 +110,8 @@ async function result(box, address, signal) {
 }
 
 function warnings(list) {
-  const where = (w) => (w.where && Object.keys(w.where).length > 0 ? ` (${Object.entries(w.where).map(([k, v]) => `${k} ${v}`).join(", ")})` : "");
   return h("section", { class: "card" }, h("h2", {}, "Warnings"),
-    h("ul", { class: "warnings" }, list.map((w) => h("li", {}, h("code", {}, w.code), ` ${w.message}${where(w)}`))));
+    h("ul", { class: "warnings" }, list.map((w) => h("li", {}, h("code", {}, w.code), ` ${w.message}${place(w.where)}`))));
 }
 
 function angles(junction) {

@@ -146,4 +146,7 @@ async fn the_page_is_strict() {
 fn the_committed_document_is_the_generated_one() {
     let committed = include_str!("../../../openapi.yaml");
     assert!(service::openapi() == committed, "openapi.yaml is old: write the output of `vasculum openapi` to it");
+    let ids: Vec<_> = committed.lines().filter_map(|line| line.trim().strip_prefix("operationId: ")).collect();
+    let once: std::collections::BTreeSet<_> = ids.iter().collect();
+    assert_eq!(once.len(), ids.len(), "an operationId is used twice: {ids:?}");
 }
