@@ -82,7 +82,8 @@ impl Problem {
             FaultKind::Internal => return Self::internal(fault),
         };
         let place = fault.place();
-        let single = serde_json::json!({"code": fault.code(), "message": fault.to_string(), "where": place_json(&place)});
+        let single =
+            serde_json::json!({"code": fault.code(), "message": fault.to_string(), "where": place_json(&place)});
         Self::new(status, fault.code(), fault.to_string()).with_errors(vec![single])
     }
 

@@ -49,9 +49,8 @@ impl Server {
         std::fs::create_dir_all(&config.data_dir)
             .with_context(|| format!("cannot make the data folder {}", config.data_dir.display()))?;
         let lock = lock(&config.data_dir)?;
-        let listener = TcpListener::bind(config.listen)
-            .await
-            .with_context(|| format!("cannot listen on {}", config.listen))?;
+        let listener =
+            TcpListener::bind(config.listen).await.with_context(|| format!("cannot listen on {}", config.listen))?;
         let address = listener.local_addr()?;
         let shutdown = CancellationToken::new();
         let mut tasks = JoinSet::new();
@@ -75,7 +74,8 @@ impl Server {
         let db = state.queue.db().clone();
         let stop = shutdown.clone();
         tasks.spawn(async move {
-            let served = axum::serve(listener, http::router(state)).with_graceful_shutdown(async move { stop.cancelled().await });
+            let served = axum::serve(listener, http::router(state))
+                .with_graceful_shutdown(async move { stop.cancelled().await });
             if let Err(error) = served.await {
                 tracing::error!(%error, "the listener ended");
             }

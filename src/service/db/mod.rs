@@ -47,7 +47,10 @@ impl Db {
                 .connect_lazy_with(options(file).read_only(true).create_if_missing(false)),
         };
         MIGRATIONS.run(&db.writer).await.with_context(|| {
-            format!("the schema of {} cannot be brought up to date; is this binary older than the data?", file.display())
+            format!(
+                "the schema of {} cannot be brought up to date; is this binary older than the data?",
+                file.display()
+            )
         })?;
         Ok(db)
     }

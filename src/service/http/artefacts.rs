@@ -24,7 +24,7 @@ pub(super) fn router() -> OpenApiRouter<State> {
 }
 
 /// Lists the artefacts; empty before the job has succeeded.
-#[utoipa::path(get, path = "/v1/jobs/{id}/artefacts", tag = "results", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}/artefacts", operation_id = "list_artefacts", tag = "results", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 200, description = "Artefacts", body = ArtefactList),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json")
@@ -40,7 +40,7 @@ async fn list(
 }
 
 /// Reads an artefact, whole or in part. Its ETag is its digest.
-#[utoipa::path(get, path = "/v1/jobs/{id}/artefacts/{name}", tag = "results", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}/artefacts/{name}", operation_id = "read_artefact", tag = "results", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), ("name" = String, Path, description = "Artefact"),
         ("Range" = Option<String>, Header, description = "One range of bytes"),
         ("If-None-Match" = Option<String>, Header, description = "ETag seen before")),
@@ -71,7 +71,7 @@ struct Wanted {
 }
 
 /// Reads the result in the form of `?format=` or Accept.
-#[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "results", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}/result", operation_id = "read_result", tag = "results", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), Wanted), responses(
         (status = 200, description = "The result", content(
             (Object = "application/json"), (Vec<u8> = "model/gltf-binary"), (String = "application/x-vtk+xml"),

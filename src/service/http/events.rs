@@ -42,7 +42,7 @@ struct After {
 }
 
 /// Follows a job: `event: progress|stage|state`. The stream ends with the job; `Accept: application/json` gives a list.
-#[utoipa::path(get, path = "/v1/jobs/{id}/events", tag = "jobs", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}/events", operation_id = "follow_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), After,
         ("Last-Event-ID" = Option<i64>, Header, description = "Resume after this event")),
     responses(

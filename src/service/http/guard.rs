@@ -41,7 +41,10 @@ pub(super) async fn host(Shared(state): Shared<State>, request: Request, next: N
             return Problem::new(
                 StatusCode::MISDIRECTED_REQUEST,
                 "host.refused",
-                format!("Without keys this service answers only as localhost:{0} or 127.0.0.1:{0}.", state.address.port()),
+                format!(
+                    "Without keys this service answers only as localhost:{0} or 127.0.0.1:{0}.",
+                    state.address.port()
+                ),
             )
             .into_response();
         }
@@ -68,7 +71,8 @@ mod tests {
         for good in ["localhost:81", "127.0.0.1:81", "[::1]:81", "LOCALHOST:81"] {
             assert!(names_loopback(good, 81), "{good}");
         }
-        for bad in ["evil.example:81", "localhost", "localhost:82", "localhost.evil.example:81", "", "[::1]", "127.0.0.1:"]
+        for bad in
+            ["evil.example:81", "localhost", "localhost:82", "localhost.evil.example:81", "", "[::1]", "127.0.0.1:"]
         {
             assert!(!names_loopback(bad, 81), "{bad}");
         }

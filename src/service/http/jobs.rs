@@ -70,7 +70,7 @@ struct SubmitForm {
 }
 
 /// Sends a scan and makes a job. A 202 is given once the job is durable.
-#[utoipa::path(post, path = "/v1/jobs", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs", operation_id = "create_job", tag = "jobs", security(("key" = [])),
     params(
         ("Idempotency-Key" = Option<String>, Header, description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
@@ -96,7 +96,8 @@ async fn create(
     let key = idempotency_key(&headers)?;
     let upload = multipart::read(&state, form).await?;
     let files = intake(&state.config, upload.files).await?;
-    let (input, files) = tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
+    let (input, files) =
+        tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
     let id = Uuid::now_v7();
     let bytes: u64 = input.files.iter().map(|f| f.bytes).sum();
     let job = NewJob {
@@ -196,7 +197,8 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
 /// `Prefer: wait=N` (RFC 7240).
 fn preferred_wait(headers: &HeaderMap) -> Option<Duration> {
     let prefers = headers.get_all("prefer").iter().filter_map(|v| v.to_str().ok()).flat_map(|v| v.split([',', ';']));
-    let seconds = prefers.filter_map(|p| p.trim().strip_prefix("wait=")?.trim_matches('"').parse::<u64>().ok()).next()?;
+    let seconds =
+        prefers.filter_map(|p| p.trim().strip_prefix("wait=")?.trim_matches('"').parse::<u64>().ok()).next()?;
     Some(Duration::from_secs(seconds.min(LONGEST_WAIT)))
 }
 
@@ -253,7 +255,7 @@ struct Listing {
 }
 
 /// Lists jobs, newest first.
-#[utoipa::path(get, path = "/v1/jobs", tag = "jobs", security(("key" = [])), params(Listing), responses(
+#[utoipa::path(get, path = "/v1/jobs", operation_id = "list_jobs", tag = "jobs", security(("key" = [])), params(Listing), responses(
     (status = 200, description = "A page; `Link: rel=next` and `next` lead to the next one", body = JobList),
     (status = 400, description = "The query cannot be understood", body = Problem, content_type = "application/problem+json")
 ))]
@@ -289,7 +291,7 @@ struct Waiting {
 }
 
 /// Reads a job.
-#[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", security(("key" = [])),
+#[utoipa::path(get, path = "/v1/jobs/{id}", operation_id = "read_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), Waiting,
         ("If-None-Match" = Option<String>, Header, description = "ETag seen before")),
     responses(
@@ -321,7 +323,7 @@ fn tag(row: &JobRow) -> String {
 }
 
 /// Cancels a job. A queued one ends at once, a running one within two seconds; its scan is erased.
-#[utoipa::path(post, path = "/v1/jobs/{id}/cancel", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs/{id}/cancel", operation_id = "cancel_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 200, description = "Cancelled", body = Job),
         (status = 202, description = "The worker was told", body = Job),
@@ -346,7 +348,7 @@ async fn cancel(Shared(state): Shared<State>, who: Principal, Path(id): Path<Str
 }
 
 /// Puts a failed job back into the queue with all its attempts.
-#[utoipa::path(post, path = "/v1/jobs/{id}/retry", tag = "jobs", security(("key" = [])),
+#[utoipa::path(post, path = "/v1/jobs/{id}/retry", operation_id = "retry_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 202, description = "Queued again", body = Job),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
@@ -368,7 +370,7 @@ async fn retry(Shared(state): Shared<State>, who: Principal, Path(id): Path<Stri
 }
 
 /// Erases a job with its scan, events and artefacts; a running one is cancelled first.
-#[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", security(("key" = [])),
+#[utoipa::path(delete, path = "/v1/jobs/{id}", operation_id = "erase_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
         (status = 204, description = "Erased"),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json")

@@ -131,9 +131,11 @@ async fn collect(state: &State, mut field: Field<'_>, budget: &mut Budget, most:
 
 fn broken(error: MultipartError) -> Problem {
     match error.status() {
-        StatusCode::PAYLOAD_TOO_LARGE => {
-            Problem::new(StatusCode::PAYLOAD_TOO_LARGE, "upload.too_large", "The upload is larger than this service takes.")
-        }
+        StatusCode::PAYLOAD_TOO_LARGE => Problem::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            "upload.too_large",
+            "The upload is larger than this service takes.",
+        ),
         _ => Problem::new(
             StatusCode::BAD_REQUEST,
             "upload.broken",

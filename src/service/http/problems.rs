@@ -90,7 +90,8 @@ async fn plain(status: StatusCode, body: Body) -> Problem {
         s if s.is_server_error() => ("internal", "The service met a fault of its own."),
         _ => ("bad_request", "The request cannot be understood."),
     };
-    let detail = if said.is_empty() || status.is_server_error() { detail.to_owned() } else { format!("{detail} {said}") };
+    let detail =
+        if said.is_empty() || status.is_server_error() { detail.to_owned() } else { format!("{detail} {said}") };
     Problem::new(status, code, detail)
 }
 

@@ -25,7 +25,7 @@ struct Session {
 }
 
 /// Begins a session of the portal: the key becomes a cookie of this origin.
-#[utoipa::path(post, path = "/v1/session", tag = "jobs", request_body = Session, responses(
+#[utoipa::path(post, path = "/v1/session", operation_id = "begin_session", tag = "jobs", request_body = Session, responses(
     (status = 204, description = "The cookie is set"),
     (status = 401, description = "The key is unknown or revoked", body = Problem, content_type = "application/problem+json")
 ))]
@@ -37,7 +37,7 @@ async fn begin(Shared(state): Shared<State>, Json(session): Json<Session>) -> Re
 }
 
 /// Ends the session.
-#[utoipa::path(delete, path = "/v1/session", tag = "jobs", responses((status = 204, description = "The cookie is gone")))]
+#[utoipa::path(delete, path = "/v1/session", operation_id = "end_session", tag = "jobs", responses((status = 204, description = "The cookie is gone")))]
 async fn end() -> Response {
     cookie(&format!("{COOKIE}=; Path=/; HttpOnly; SameSite=Strict; Max-Age=0"))
 }

@@ -42,7 +42,7 @@ struct Stats {
 }
 
 /// Counts jobs and says what is free.
-#[utoipa::path(get, path = "/v1/stats", tag = "monitoring", security(("key" = [])), responses(
+#[utoipa::path(get, path = "/v1/stats", operation_id = "read_stats", tag = "monitoring", security(("key" = [])), responses(
     (status = 200, description = "Figures", body = Stats)
 ))]
 async fn stats(Shared(state): Shared<State>, who: Principal) -> Result<Json<Stats>, Problem> {

@@ -179,6 +179,9 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn is_known(&self, id: Uuid) -> sqlx::Result<Option<JobState>> {
-        sqlx::query_scalar("SELECT state FROM job WHERE id = $1").bind(id.to_string()).fetch_optional(&self.db().reader).await
+        sqlx::query_scalar("SELECT state FROM job WHERE id = $1")
+            .bind(id.to_string())
+            .fetch_optional(&self.db().reader)
+            .await
     }
 }

@@ -37,7 +37,9 @@ pub(super) fn crashed(how: &str) -> Problem {
     Problem::new(
         StatusCode::INTERNAL_SERVER_ERROR,
         "job.crashed",
-        format!("The job's process died at every attempt ({how}). Retry it, or send a smaller volume if memory is short."),
+        format!(
+            "The job's process died at every attempt ({how}). Retry it, or send a smaller volume if memory is short."
+        ),
     )
 }
 
@@ -49,13 +51,12 @@ impl Queue {
     /// The database's; nothing was written.
     pub async fn close(&self, claim: &Claim, closing: &Closing) -> sqlx::Result<Option<JobState>> {
         let mut tx = self.db().writer.begin_with("BEGIN IMMEDIATE").await?;
-        let cancel: Option<bool> = sqlx::query_scalar(
-            "SELECT cancel_requested FROM job WHERE id = $1 AND fence = $2 AND state = 'running'",
-        )
-        .bind(&claim.id)
-        .bind(claim.fence)
-        .fetch_optional(&mut *tx)
-        .await?;
+        let cancel: Option<bool> =
+            sqlx::query_scalar("SELECT cancel_requested FROM job WHERE id = $1 AND fence = $2 AND state = 'running'")
+                .bind(&claim.id)
+                .bind(claim.fence)
+                .fetch_optional(&mut *tx)
+                .await?;
         let Some(cancel) = cancel else { return Ok(None) };
         let (state, error) = outcome(claim, closing, cancel);
         sqlx::query(concat!(

@@ -101,7 +101,8 @@ async fn every_error_is_a_problem() {
 async fn a_trace_goes_through() {
     let service = Service::start().await;
     let trace = "4bf92f3577b34da6a3ce929d0e0e4736";
-    let request = service.request(Method::GET, "/nowhere").header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"));
+    let request =
+        service.request(Method::GET, "/nowhere").header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"));
     assert_eq!(request.send().await.unwrap().headers()["x-trace-id"], trace);
     service.stop().await;
 }
@@ -145,4 +146,7 @@ async fn the_page_is_strict() {
 fn the_committed_document_is_the_generated_one() {
     let committed = include_str!("../../../openapi.yaml");
     assert!(service::openapi() == committed, "openapi.yaml is old: write the output of `vasculum openapi` to it");
+    let ids: Vec<_> = committed.lines().filter_map(|line| line.trim().strip_prefix("operationId: ")).collect();
+    let once: std::collections::BTreeSet<_> = ids.iter().collect();
+    assert_eq!(once.len(), ids.len(), "an operationId is used twice: {ids:?}");
 }

@@ -9,23 +9,42 @@ use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
+/// A server process that ends with its test, however that ends.
+struct Process(Child);
+
+impl Process {
+    /// SIGKILL: no word, no clean-up.
+    fn kill(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// The example `serve`, built beside this test.
 fn program() -> PathBuf {
     let deps = std::env::current_exe().unwrap();
     deps.parent().unwrap().parent().unwrap().join("examples/serve")
 }
 
-fn start(folder: &Path) -> (Child, String) {
+fn start(folder: &Path) -> (Process, String) {
     let mut child = Command::new(program())
         .args([folder.join("data"), PathBuf::from("python3"), support::script(folder)])
         .stdout(Stdio::piped())
+        .stderr(Stdio::null())
         .spawn()
         .unwrap();
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     let base = line.trim().strip_prefix("listening on ").unwrap().to_owned();
     assert_eq!(std::fs::read_to_string(folder.join("data/listen")).unwrap().trim(), base);
-    (child, base)
+    (Process(child), base)
 }
 
 async fn digests(client: &reqwest::Client, base: &str, id: &str) -> Value {
@@ -54,13 +73,11 @@ async fn a_killed_server_finishes_its_job_after_restart() {
             break;
         }
     }
-    server.kill().unwrap();
-    server.wait().unwrap();
+    server.kill();
 
     let (mut server, base) = start(folder.path());
     let job = support::ended(&client, &base, &killed).await;
     assert_eq!((&job["state"], &job["attempt"]), (&json!("succeeded"), &json!(2)));
     assert_eq!(digests(&client, &base, &killed).await, wanted);
-    server.kill().unwrap();
-    server.wait().unwrap();
+    server.kill();
 }

@@ -78,9 +78,8 @@ impl Child {
         command.current_dir(folder.path()).env("TMPDIR", folder.path()).env("VASCULUM_TRACE_ID", &claim.trace_id);
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.process_group(0).kill_on_drop(true);
-        let mut process = command.spawn().map_err(|e| {
-            anyhow::anyhow!("cannot start {}: {e}", config.executable.display())
-        })?;
+        let mut process =
+            command.spawn().map_err(|e| anyhow::anyhow!("cannot start {}: {e}", config.executable.display()))?;
         let stdout = process.stdout.take().ok_or_else(|| anyhow::anyhow!("the child has no stdout"))?;
         if let Some(stderr) = process.stderr.take() {
             tokio::spawn(log(stderr, claim.id.clone(), claim.trace_id.clone()));
