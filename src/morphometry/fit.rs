@@ -4,7 +4,7 @@
 //! 2009): a medial line has errors at a right angle to itself in every direction, and a few points that a side branch or
 //! a plaque has pulled off. Ordinary regression on one coordinate is biased when the vessel is oblique.
 
-use crate::linear::{eigen3, median, outer};
+use crate::linear::{eigen3, median, outer, positive};
 use space::{DMat3, DVec3, P3, V3};
 
 /// Tukey's constant: 95 % efficiency for normal errors.
@@ -59,7 +59,7 @@ fn principal(points: &[(DVec3, f64)], robust: &[f64], towards: DVec3) -> Option<
     let mean = points.iter().zip(robust).fold(DVec3::ZERO, |m, (p, r)| m + (p.0 - base) * (p.1 * r)) / total;
     let spread = points.iter().zip(robust).fold(DMat3::ZERO, |m, (p, r)| m + outer(p.0 - base - mean, p.1 * r / total));
     let [(a, _), (b, _), (c, axis)] = eigen3(spread);
-    if !(c > 0.0) || !(total > 0.0) {
+    if !positive(c) || !positive(total) {
         return None;
     }
     let axis = if axis.dot(towards) < 0.0 { -axis } else { axis };

@@ -7,7 +7,7 @@
 //! the curve, weighted by Tukey's biweight, minimised by Levenberg and Marquardt (More 1978). Frenet's formulas on
 //! differences of the line were rejected: their torsion has a standard deviation of 18 times the value.
 
-use crate::linear::{median, solve};
+use crate::linear::{median, positive, solve};
 use space::{DMat3, DVec3, P3};
 
 use crate::types::Helix;
@@ -146,7 +146,7 @@ pub fn fit_helix(points: &[P3]) -> Option<Helix> {
     let points: Vec<DVec3> = points.iter().map(|p| p.raw()).collect();
     let s = crate::line::arc_length(&points);
     let length = s[s.len() - 1];
-    if !(length > 0.0) {
+    if !positive(length) {
         return None;
     }
     let (curve, middle) = start(&points, &s)?;
@@ -261,7 +261,7 @@ fn report(state: &State, weight: &[f64], points: &[DVec3], length: f64) -> Optio
     last[FREE - 1] = 1.0;
     let variance = solve(a, last)?[FREE - 1] * (unit[FREE - 1] * rms).powi(2);
     let total_turn = k * k + t * t;
-    if !(variance.max(0.0).sqrt() <= TORSION_ERROR_MAX * total_turn.sqrt()) {
+    if !positive(TORSION_ERROR_MAX * total_turn.sqrt() - variance.max(0.0).sqrt()) {
         return None;
     }
     Some(Helix {
@@ -323,7 +323,7 @@ mod tests {
     fn a_few_points_that_were_pulled_off_do_not_count() {
         let mut points = helix(0.049, 0.033, 80.0, 0.01);
         for i in [20, 21, 22, 90] {
-            points[i] = points[i] + space::V3::new(0.8, -0.5, 0.3);
+            points[i] += space::V3::new(0.8, -0.5, 0.3);
         }
         let h = fit_helix(&points).unwrap();
         assert!((h.torsion_per_mm / 0.033 - 1.0).abs() < 3e-3, "{h:?}");

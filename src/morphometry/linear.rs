@@ -7,7 +7,7 @@ pub(crate) fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Op
     let scale = a.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
     for c in 0..N {
         let p = (c..N).max_by(|&i, &j| a[i][c].abs().total_cmp(&a[j][c].abs()))?;
-        if !(a[p][c].abs() > 1e-14 * scale) {
+        if !positive(a[p][c].abs() - 1e-14 * scale) {
             return None;
         }
         a.swap(c, p);
@@ -46,8 +46,8 @@ pub(crate) fn eigen3(m: DMat3) -> [(f64, DVec3); 3] {
             let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
             let c = 1.0 / t.hypot(1.0);
             let s = t * c;
-            for k in 0..3 {
-                (a[k][p], a[k][q]) = (c * a[k][p] - s * a[k][q], s * a[k][p] + c * a[k][q]);
+            for row in &mut a {
+                (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
             }
             for k in 0..3 {
                 (a[p][k], a[q][k]) = (c * a[p][k] - s * a[q][k], s * a[p][k] + c * a[q][k]);
@@ -58,6 +58,11 @@ pub(crate) fn eigen3(m: DMat3) -> [(f64, DVec3); 3] {
     let mut out = [0, 1, 2].map(|i| (a[i][i], DVec3::from_array(v[i])));
     out.sort_by(|x, y| x.0.total_cmp(&y.0));
     out
+}
+
+/// Whether a number is greater than 0, and a number at all.
+pub(crate) fn positive(x: f64) -> bool {
+    x > 0.0
 }
 
 /// The middle value (mean of the two middle ones); `None` of nothing.

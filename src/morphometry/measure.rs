@@ -108,7 +108,7 @@ struct Spot {
 }
 
 impl Spot {
-    fn where_(&self) -> Place {
+    fn place(&self) -> Place {
         Place { element: Some(self.node), position: Some(self.position), ..Place::none() }
     }
 }
@@ -283,21 +283,21 @@ impl Site<'_> {
                 format!(
                     "{name} at junction {node} has no value: the vessel stands upright on the plane (within 5 degrees)"
                 ),
-                self.place.where_(),
+                self.place.place(),
             ),
             Undefined::NoPlane | Undefined::NoLine => Warning::new(
                 "angles.plane_undefined",
                 format!(
                     "{name} at junction {node} has no value: graft and proximal vessel lie within 5 degrees of one line and span no plane"
                 ),
-                self.place.where_(),
+                self.place.place(),
             ),
         }
     }
 
     fn warn_windows(&self, ids: &[usize], settings: &Settings, warnings: &mut Vec<Warning>) {
         let (node, d) = (self.place.node, self.diameter);
-        let mut warn = |code, message| warnings.push(Warning::new(code, message, self.place.where_()));
+        let mut warn = |code, message| warnings.push(Warning::new(code, message, self.place.place()));
         if self.axes.point.is_none() {
             warn(
                 "angles.axes_parallel",

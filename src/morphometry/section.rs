@@ -8,6 +8,7 @@
 //!
 //! Limits: a section that is not star-shaped about its centre is cut short by its nearer wall.
 
+use crate::linear::positive;
 use imaging::CutPlane;
 use implicit::Field;
 use space::{DVec3, P3, V3};
@@ -76,7 +77,7 @@ impl Lumen<'_> {
         if self.exit(centre.raw(), DVec3::ZERO) <= 0.0 {
             return Cut::Open;
         }
-        if !(f > 0.0) || !(radius_mm > 0.0) {
+        if !positive(f) || !positive(radius_mm) {
             return Cut::Outside;
         }
         let (u, v) = frame(tangent.raw());
@@ -144,7 +145,7 @@ impl Lumen<'_> {
         let (mut b, mut fb) = loop {
             let b = (a + STEP_RADII * radius).min(limit);
             let fb = self.field.value(at(b));
-            if !(fb > 0.0) {
+            if !positive(fb) {
                 break (b, fb);
             }
             if b >= limit {

@@ -6,7 +6,7 @@
 
 use crate::Error;
 use crate::line::{Samples, arc_length, locate};
-use crate::linear::median;
+use crate::linear::{median, positive};
 use crate::section::{Cut, Lumen, Outline, RAYS, RAYS_COARSE};
 use crate::types::Section;
 use exec::Ctx;
@@ -204,6 +204,11 @@ pub(crate) fn tracks(graph: &MedialGraph, lumen: Lumen<'_>, ctx: &Ctx) -> Result
 /// The reported sections, once the junctions have flagged what overlaps.
 pub(crate) fn finish(tracks: &mut [Track], lumen: Lumen<'_>, ctx: &Ctx) -> Result<(), Error> {
     for t in tracks.iter_mut() {
+        // centroids of overlapping lumens wander, which would lengthen the line
+        for (section, medial) in t.sections.iter_mut().zip(&t.medial).filter(|(s, _)| s.in_junction) {
+            section.position = P3::from_raw(*medial);
+        }
+        t.measure_length();
         t.straighten();
     }
     cut_all(tracks, lumen, RAYS, ctx)?;
@@ -268,7 +273,7 @@ fn track(graph: &MedialGraph, id: usize) -> Result<Track, Error> {
         (from, to) = (to, from);
     }
     let typical = median(radius.clone()).unwrap_or(0.0);
-    if !(arc_length(&points)[points.len() - 1] > 0.0) || !(typical > 0.0) {
+    if !positive(arc_length(&points)[points.len() - 1]) || !positive(typical) {
         return Err(bad("no length or no radius"));
     }
     // sampled and smoothed twice: kinks, which lengthen the line and crowd its samples, are gone in the second round

@@ -153,6 +153,7 @@ fn the_five_angles_are_met_to_a_twentieth_of_a_degree() {
     ] {
         let case = anastomosis(theta, tilt, radii, wobble);
         let m = run(&case, points(&case, [true; 3])).unwrap();
+        assert!(!codes(&m).contains(&"angles.unsettled"), "{:?}", m.warnings);
         let j = &m.junctions[0];
         for (name, expected) in truth(theta, tilt) {
             let value = angle(j, name).unwrap_or_else(|| panic!("{name} null at {theta}: {:?}", m.warnings));
@@ -178,7 +179,7 @@ fn areas_perimeters_and_radii_of_round_tubes() {
             assert!((s.radius_inscribed_mm / r - 1.0).abs() < 1e-3, "{s:?}");
             assert!(s.curvature_per_mm.is_none_or(|k| k < 2e-3), "{s:?}");
         }
-        assert!((b.tortuosity - 1.0).abs() < 0.02, "{} {}", b.tortuosity, b.length_mm);
+        assert!((b.tortuosity - 1.0).abs() < 0.01, "{} {}", b.tortuosity, b.length_mm);
     }
 }
 
@@ -276,7 +277,9 @@ fn roles_that_cannot_be_are_refused_with_their_field() {
 fn a_short_branch_gives_null_and_says_why() {
     let branches =
         [(DVec3::new(1.0, 0.0, 1.0), 10.0, 2.5), (DVec3::Z, 36.0, 3.0), (DVec3::new(0.0, 0.2, -1.0), 36.0, 3.0)];
-    let case = star(DVec3::ZERO, &branches, 0.0);
+    let mut case = star(DVec3::ZERO, &branches, 0.0);
+    // a plane across the graft that leaves the host whole
+    case.cuts[0] = CutPlane { point: P3::new(8.0, 0.0, 0.0), outward: V3::X };
     let roles = Roles { graft: Some(case.graph.edges[0].points[30]), ..Roles::default() };
     let m = run(&case, roles).unwrap();
     assert_eq!(angle(&m.junctions[0], "graft_host_a"), None);
