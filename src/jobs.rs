@@ -147,7 +147,8 @@ struct Shown {
 
 impl Shown {
     fn new() -> Self {
-        let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %").unwrap_or_else(|_| ProgressStyle::default_bar());
+        let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %")
+            .unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(1000).with_style(style));
         Self { bar, stage: Mutex::default() }
     }

@@ -111,9 +111,10 @@ pub(crate) fn truth_json(truth: &Truth) -> Value {
         .flat_map(|j| j.angles.named())
         .map(|(name, value)| (name.to_owned(), json!(value)))
         .collect();
-    let junction = truth.junction.as_ref().map(|j| {
-        json!({"axes_point": point(j.axes_point), "plane_normal": vector(j.plane_normal)})
-    });
+    let junction = truth
+        .junction
+        .as_ref()
+        .map(|j| json!({"axes_point": point(j.axes_point), "plane_normal": vector(j.plane_normal)}));
     let helix = truth.helix.as_ref().map(|h| {
         json!({"curvature_per_mm": h.curvature_per_mm, "torsion_per_mm": h.torsion_per_mm, "radius_mm": h.radius_mm,
                "pitch_mm": h.pitch_mm})

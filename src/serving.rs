@@ -67,9 +67,7 @@ fn check_plan(bytes: &[u8]) -> Result<(), Problem> {
     match artefact::plan::Plan::parse(bytes) {
         Ok(_) => Ok(()),
         Err(faults) => {
-            let each = |f: &artefact::plan::PlanFault| {
-                serde_json::json!({"code": f.code, "message": f.message, "where": {"field": f.field}})
-            };
+            let each = |f: &artefact::plan::PlanFault| serde_json::json!({"code": f.code, "message": f.message, "where": {"field": f.field}});
             Err(Problem::from_fault(&faults).with_errors(faults.faults.iter().map(each).collect()))
         }
     }

@@ -22,8 +22,7 @@ const ARROWS: &[(&str, &[&str])] = &[
 ];
 
 /// Crates that hold numbers only.
-const DOMAIN: &[&str] =
-    &["space", "exec", "imaging", "implicit", "surface", "skeleton", "morphometry", "phantom"];
+const DOMAIN: &[&str] = &["space", "exec", "imaging", "implicit", "surface", "skeleton", "morphometry", "phantom"];
 /// What a domain crate never imports.
 const FOREIGN: &[&str] = &["tokio", "axum", "sqlx", "serde", "serde_json", "tracing", "image", "zip", "reqwest"];
 

@@ -67,8 +67,7 @@ fn run_with(input: &Path, plan: &Path, threads: usize) -> BTreeMap<String, Vec<u
     let dir = TempDir::new().unwrap();
     let out = dir.path().join("out");
     let threads = threads.to_string();
-    let done =
-        vasculum(&["run", path(input), "--plan", path(plan), "--out", path(&out), "--threads", &threads]);
+    let done = vasculum(&["run", path(input), "--plan", path(plan), "--out", path(&out), "--threads", &threads]);
     assert!(done.status.success(), "{}", text(&done.stderr));
     artefacts(&out)
 }
@@ -96,8 +95,16 @@ fn the_graph_and_the_surface_are_those_of_a_bifurcation() {
     assert!(r["surface"]["min_angle_deg"].as_f64().unwrap() >= 25.0);
     let px = &r["surface"]["displacement_px"];
     assert!(px["max"].as_f64().unwrap() <= 1.0 && px["min"].as_f64().unwrap() >= -1.0);
-    for name in ["skeleton.json", "skeleton.vtp", "surface.vtp", "surface.glb", "surface.stl", "contours.vtp",
-                 "report.html", "angles.csv"] {
+    for name in [
+        "skeleton.json",
+        "skeleton.vtp",
+        "surface.vtp",
+        "surface.glb",
+        "surface.stl",
+        "contours.vtp",
+        "report.html",
+        "angles.csv",
+    ] {
         assert!(reference().contains_key(name), "{name} is missing");
     }
 }

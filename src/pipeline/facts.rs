@@ -26,7 +26,12 @@ pub(crate) fn segmentation(contours: &Contours, r: &imaging::Report) -> Segmenta
         contours: contours.curves.len(),
         lumens: r.lumens.iter().map(|&(plane, count)| [plane, count]).collect(),
         axis: axis(contours.axis).to_owned(),
-        candidates: r.candidates.iter().enumerate().map(|(i, c)| Candidate { score: c.score, chosen: i == 0 }).collect(),
+        candidates: r
+            .candidates
+            .iter()
+            .enumerate()
+            .map(|(i, c)| Candidate { score: c.score, chosen: i == 0 })
+            .collect(),
     }
 }
 

@@ -58,9 +58,8 @@ fn reconstruct(
     let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
     let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
     let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
-    let morphometry = steps.step("measure", |ctx| {
-        morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx)
-    })?;
+    let morphometry = steps
+        .step("measure", |ctx| morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx))?;
 
     let warnings: Vec<Warning> =
         [input.warnings.clone(), segmentation.warnings.clone(), medial.warnings].into_iter().flatten().collect();
@@ -123,10 +122,8 @@ fn smoothed(
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<(Sampled, Image), implicit::Error> {
-    let smoothing = Smoothing {
-        max_displacement_px: plan.smoothing.max_displacement_px,
-        ..Smoothing::new(contours.pixel_mm)
-    };
+    let smoothing =
+        Smoothing { max_displacement_px: plan.smoothing.max_displacement_px, ..Smoothing::new(contours.pixel_mm) };
     let sampled = Sampled::new(f, &raw.vertices, &smoothing.sampling(), &ctx.part(0.0, 0.6))?;
     let kept = within(contours, &raw.vertices);
     let image = Image { smoothing, wall: kept, sampled: sampled.clone() };

@@ -130,7 +130,9 @@ fn apt(what: &str, packages: &[&str]) -> Result<()> {
     let mut whoami = std::process::Command::new("id");
     whoami.arg("-u");
     let root = whoami.output().is_ok_and(|o| o.stdout.starts_with(b"0"));
-    for arguments in [vec!["update", "-qq"], [vec!["install", "-y", "-qq", "--no-install-recommends"], packages.to_vec()].concat()] {
+    for arguments in
+        [vec!["update", "-qq"], [vec!["install", "-y", "-qq", "--no-install-recommends"], packages.to_vec()].concat()]
+    {
         let mut command = shell::command(if root { "apt-get" } else { "sudo" });
         if !root {
             command.arg("apt-get");
