@@ -60,7 +60,7 @@ pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphomet
         min_angle_deg: wall.quality.min_angle_deg,
         max_angle_deg: wall.quality.max_angle_deg,
         watertight: true,
-        euler: wall.topology.euler as i64,
+        euler: wall.topology.euler,
         components: wall.topology.components,
         max_error_mm: wall.quality.face_max_mm,
         area_mm2: wall.mesh.area(),
