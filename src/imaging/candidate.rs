@@ -37,6 +37,11 @@ const LEAST_LENGTH_MM: f64 = 8.0;
 const END_RADII: f64 = 1.8;
 /// A tube is at least this many radii long; a ball has 2 to 3.
 const LEAST_SLENDERNESS: f64 = 4.0;
+/// Largest mean radius of a vessel, mm: twice the largest asked for; the trunk of a child has 60.
+pub(crate) const LARGEST_RADIUS_MM: f64 = 20.0;
+/// Least mean step across the boundary, as a share of the mean height inside: a lumen at its half level has .3 to .6,
+/// a level set of a bias field only its noise.
+const LEAST_EDGE: f64 = 0.12;
 /// Below this roundness a component is a sheet or a tangle.
 const LEAST_ROUNDNESS: f64 = 0.35;
 
@@ -126,7 +131,12 @@ fn measured(v: &Volume, level: f64, voxels: Vec<u32>, strict: bool) -> Option<Ca
     let tube = (volume / (std::f64::consts::PI * length_mm.max(1e-9))).sqrt();
     let roundness = (radius_mm / tube).min(1.0);
     let slender = length_mm > LEAST_LENGTH_MM && length_mm > LEAST_SLENDERNESS * radius_mm;
-    if strict && (!slender || radius_mm < 0.5 * LEAST_RADIUS_MM || roundness < LEAST_ROUNDNESS) {
+    if radius_mm > LARGEST_RADIUS_MM {
+        return None;
+    }
+    if strict
+        && (!slender || step < LEAST_EDGE * height || radius_mm < 0.5 * LEAST_RADIUS_MM || roundness < LEAST_ROUNDNESS)
+    {
         return None;
     }
     let branching = if ends >= 2 { 2.0 } else { 1.0 };

@@ -1,6 +1,6 @@
 //! The chosen vessel tree as voxels with the local level of its wall.
 
-use crate::candidate::{Candidate, Wanted, candidates, levels};
+use crate::candidate::{Candidate, LARGEST_RADIUS_MM, Wanted, candidates, levels};
 use crate::level::{Fields, Patch};
 use crate::volume::{Volume, median, noise, without_background};
 use crate::{Error, Settings, Stack};
@@ -373,6 +373,10 @@ fn accepted(s: &Segmentation) -> Result<(), Error> {
     let contrast = median(&mut contrast);
     if contrast < LEAST_CONTRAST * s.noise {
         let reason = format!("the best structure has a contrast of {contrast:.2} where the noise is {:.2}", s.noise);
+        return Err(Error::NoVessel { reason });
+    }
+    if s.radius_mm > LARGEST_RADIUS_MM {
+        let reason = format!("the best structure has a mean radius of {:.1} mm, too wide for a vessel", s.radius_mm);
         return Err(Error::NoVessel { reason });
     }
     Ok(())

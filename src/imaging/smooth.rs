@@ -17,11 +17,11 @@ pub(crate) struct Smoothed {
     pub(crate) standard_error: f64,
 }
 
-/// Inflation of the degrees of freedom in GCV.
+/// Inflation of the degrees of freedom in GCV: at 1.15 discs come out 2 to 3 times worse than at 1.4.
 const INFLATION: f64 = 1.4;
-/// Data points per knot: marching squares give 1.27 points per pixel of arc, so that knots are 1.6 px apart; at 3
-/// points the crotch of two merging lumens is rounded off.
-const POINTS_PER_KNOT: f64 = 2.0;
+/// Data points per knot: marching squares give 1.27 points per pixel of arc, so that knots are 1.2 px apart. At 2 points
+/// peanut shapes lose 2 to 4 % of their accuracy, discs gain nothing.
+const POINTS_PER_KNOT: f64 = 1.5;
 /// Knots, least and most (the dense solve costs their cube / 6).
 const KNOTS: (usize, usize) = (12, 160);
 /// Rounds of fit and new parameters.

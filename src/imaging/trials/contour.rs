@@ -84,3 +84,41 @@ fn discs_are_as_exact_as_their_noise_allows() {
     }
     assert!(worst <= 1.0, "{worst}");
 }
+
+#[test]
+fn the_small_disc_keeps_its_area() {
+    let mut area = 0.0;
+    for seed in 0..20 {
+        let mut n = Noise::new(1000 + seed);
+        let (cx, cy) = (19.5 + n.uniform(), 19.5 + n.uniform());
+        let (s, _) = contour(&image(|x, y| (x - cx).hypot(y - cy) - 5.0), 20.0, seed);
+        area += (s.area() / (std::f64::consts::PI * 25.0) - 1.0) / 20.0;
+    }
+    assert!(area.abs() <= 0.006, "{area}");
+}
+
+#[test]
+fn peanuts_keep_their_waist() {
+    let mut worst: f64 = 0.0;
+    for (radius, bar) in [(5.0, 0.080), (7.5, 0.072), (10.0, 0.068)] {
+        let mut sum = 0.0;
+        for seed in 0..20 {
+            let mut n = Noise::new(2000 + seed);
+            let (cx, cy, a) = (19.5 + n.uniform(), 19.5 + n.uniform(), std::f64::consts::TAU * n.uniform());
+            // two discs of .6 radius, .5 radius from the middle, smoothly joined
+            let d = |x: f64, y: f64| {
+                let (x, y) = (x - cx, y - cy);
+                let one =
+                    |s: f64| (x - s * 0.5 * radius * a.cos()).hypot(y - s * 0.5 * radius * a.sin()) - 0.6 * radius;
+                let (p, q, k) = (one(1.0), one(-1.0), 0.4 * radius);
+                let h = (k - (p - q).abs()).max(0.0) / k;
+                p.min(q) - k * h * h * h / 6.0
+            };
+            let (s, _) = contour(&image(d), 20.0, seed);
+            sum += off(&s, d) / 20.0;
+        }
+        println!("peanut {radius}: rms {:.4} (bar {bar})", sum.sqrt());
+        worst = worst.max(sum.sqrt() / bar);
+    }
+    assert!(worst <= 1.0, "{worst}");
+}

@@ -1,4 +1,4 @@
-//! A small simulator: capsules as distance functions, blurred analytically, with bias, fading and Rician noise.
+//! A small simulator: capsules as distance functions, area-sampled and blurred within the slices, with bias, fading and Rician noise.
 
 use crate::Stack;
 use space::{P3, V3};
@@ -69,27 +69,56 @@ impl Scan {
             seed: 1,
         }
     }
+    /// Share of lumen in every pixel: 4 x 4 sub-samples, then a point spread of .6 px within the slices.
+    fn shares(&self) -> Vec<f64> {
+        let [w, h, d] = self.n;
+        let sub = self.step[0] / 4.0;
+        let mut share: Vec<f64> = (0..w * h * d)
+            .map(|i| {
+                let at = |dx: f64, dy: f64| {
+                    let p = [(i % w) as f64 + dx, (i / w % h) as f64 + dy, (i / w / h) as f64];
+                    let p = [p[0] * self.step[0], p[1] * self.step[1], p[2] * self.step[2]];
+                    self.vessels.iter().map(|c| distance(c, p)).fold(f64::MAX, f64::min)
+                };
+                let middle = at(0.0, 0.0);
+                if middle.abs() > 1.5 * self.step[0] {
+                    return f64::from(u8::from(middle < 0.0));
+                }
+                let off = |k: usize| (k as f64 - 1.5) / 4.0;
+                (0..16).map(|k| (0.5 - at(off(k % 4), off(k / 4)) / sub).clamp(0.0, 1.0)).sum::<f64>() / 16.0
+            })
+            .collect();
+        let weight = [0, 1, 2, 3].map(|k| (-0.5 * (f64::from(k) / 0.6).powi(2)).exp());
+        let sum = weight[0] + 2.0 * (weight[1] + weight[2] + weight[3]);
+        for (stride, n) in [(1, w), (w, h)] {
+            let source = share.clone();
+            for (i, o) in share.iter_mut().enumerate() {
+                let at = (i / stride % n) as isize;
+                let tap = |k: isize| {
+                    let q = (at + k).clamp(0, n as isize - 1) - at;
+                    weight[k.unsigned_abs()] * source[(i as isize + q * stride as isize) as usize]
+                };
+                *o = (-3..=3).map(tap).sum::<f64>() / sum;
+            }
+        }
+        share
+    }
     pub(super) fn stack(&self) -> Stack {
         let n = self.n;
         let mut noise = Noise::new(self.seed);
         let middle = [0, 1, 2].map(|a| 0.5 * (n[a] - 1) as f64 * self.step[a]);
+        let share = self.shares();
         let mut pixels = Vec::with_capacity(n[0] * n[1] * n[2]);
-        for z in 0..n[2] {
-            for y in 0..n[1] {
-                for x in 0..n[0] {
-                    let p = [x as f64 * self.step[0], y as f64 * self.step[1], z as f64 * self.step[2]];
-                    let d = self.vessels.iter().map(|c| distance(c, p)).fold(f64::MAX, f64::min);
-                    // blur of .66 px: point spread .6 px and the pixel's own 1/12
-                    let share = 1.0 / (1.0 + (1.702 * d / (0.66 * self.step[0])).exp());
-                    let body = (p[0] - middle[0]).hypot(p[1] - middle[1]) < self.body;
-                    let fade = 1.0 + (self.fade - 1.0) * z as f64 / (n[2] - 1) as f64;
-                    let ground = if body { self.tissue } else { 0.0 };
-                    let wave = (p[0] / middle[0] * 1.3 + 0.4).sin() * (p[1] / middle[1] * 1.1 - 0.3).cos();
-                    let clean = (ground + (self.vessel * fade - ground) * share) * (1.0 + self.bias * wave);
-                    let (a, b) = (self.noise * noise.gauss(), self.noise * noise.gauss());
-                    pixels.push((clean + a).hypot(b) as f32);
-                }
-            }
+        for (i, share) in share.into_iter().enumerate() {
+            let z = i / n[0] / n[1];
+            let p = [(i % n[0]) as f64 * self.step[0], (i / n[0] % n[1]) as f64 * self.step[1]];
+            let body = (p[0] - middle[0]).hypot(p[1] - middle[1]) < self.body;
+            let fade = 1.0 + (self.fade - 1.0) * z as f64 / (n[2] - 1) as f64;
+            let ground = if body { self.tissue } else { 0.0 };
+            let wave = (p[0] / middle[0] * 1.3 + 0.4).sin() * (p[1] / middle[1] * 1.1 - 0.3).cos();
+            let clean = (ground + (self.vessel * fade - ground) * share) * (1.0 + self.bias * wave);
+            let (a, b) = (self.noise * noise.gauss(), self.noise * noise.gauss());
+            pixels.push((clean + a).hypot(b) as f32);
         }
         Stack {
             columns: n[0],
