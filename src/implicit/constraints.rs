@@ -117,17 +117,30 @@ fn offset(width_mm: f64, settings: &Settings) -> f64 {
 
 /// Wall points of all curves; the step between them grows until all constraints fit under the limit.
 fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
-    let spacing = plane_spacing_mm(contours);
-    let mut step = contours.pixel_mm.max(0.5 * spacing);
-    loop {
-        let count: usize = contours.curves.iter().map(|c| count_on(c, step)).sum();
-        // one interior point per wall point, and room for tips and closing points
-        if 2 * count + 64 <= settings.max_constraints || step > 1e3 * spacing.max(contours.pixel_mm) {
+    let finest = contours.pixel_mm.max(0.5 * plane_spacing_mm(contours));
+    // one interior point per wall point, and room for tips and closing points
+    let room = settings.max_constraints.saturating_sub(64 + 2 * contours.tips.len()) / 2;
+    let (mut step, mut stride) = (finest, 1);
+    while kept(contours, stride).map(|(_, c)| count_on(c, step)).sum::<usize>() > room {
+        step *= 1.05;
+        // beyond that planes are left out instead: their points interleave, so the step along the vessel may grow too
+        if step > COARSEST * finest {
+            (step, stride) = (finest, stride + 1);
+        }
+        if stride > contours.planes.len() {
             break;
         }
-        step *= 1.05;
     }
-    contours.curves.iter().enumerate().flat_map(|(i, c)| points_on(contours, i, c, step)).collect()
+    kept(contours, stride).flat_map(|(i, c)| points_on(contours, i, c, step)).collect()
+}
+
+/// Growth of the step between wall points of a contour before planes are left out.
+const COARSEST: f64 = 2.5;
+
+/// The curves of every `stride`-th plane, and of the first and the last.
+fn kept(contours: &Contours, stride: usize) -> impl Iterator<Item = (usize, &Curve)> {
+    let last = contours.planes.len().saturating_sub(1);
+    contours.curves.iter().enumerate().filter(move |(_, c)| c.plane % stride == 0 || c.plane == last)
 }
 
 fn plane_spacing_mm(contours: &Contours) -> f64 {

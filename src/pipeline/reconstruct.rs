@@ -9,7 +9,7 @@ use artefact::write::{self, NamedBytes, Provenance};
 use artefact::{Reconstruction, reconstruction::SurfaceData};
 use exec::Ctx;
 use imaging::{Contours, Stack};
-use implicit::{Sampled, Smoothing, Variational};
+use implicit::{Field, Sampled, Smoothing, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
@@ -106,12 +106,15 @@ fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
     Err(failure)
 }
 
+/// The function past the data's ends means nothing: close it just outside the cuts.
+fn bounded<'a>(field: &'a dyn Field, contours: &Contours) -> Bounded<'a> {
+    Bounded::new(field, &contours.cuts, 4.0 * contours.pixel_mm)
+}
+
 /// The zero level of f as it was fitted, polygonised at one pixel; its vertices tell where the wall is.
 fn raw_surface(f: &Variational, contours: &Contours, ctx: &Ctx) -> Result<TriMesh, surface::Error> {
     let settings = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
-    let (mut mesh, _) = surface::polygonise(f, f.wall(), &settings, ctx)?;
-    surface::project(&mut mesh, f, contours.pixel_mm, ctx)?;
-    Ok(mesh)
+    Ok(surface::polygonise(&bounded(f, contours), f.wall(), &settings, ctx)?.0)
 }
 
 /// f as a 3D image, and the same image smoothed within the plan's bound.
@@ -125,7 +128,10 @@ fn smoothed(
     let smoothing =
         Smoothing { max_displacement_px: plan.smoothing.max_displacement_px, ..Smoothing::new(contours.pixel_mm) };
     let sampled = Sampled::new(f, &raw.vertices, &smoothing.sampling(), &ctx.part(0.0, 0.6))?;
-    let kept = within(contours, &raw.vertices);
+    let inside = within(contours, &raw.vertices);
+    // polygons cut corners: only points on the zero level tell how far a filter moves it
+    let feet = ctx.map(&inside, |&p| implicit::foot(&sampled, p, contours.pixel_mm))?;
+    let kept = feet.into_iter().flatten().collect();
     let image = Image { smoothing, wall: kept, sampled: sampled.clone() };
     Ok((sampled, image))
 }
@@ -169,9 +175,7 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
 
 fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
     let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
-    // the function past the data's ends means nothing: close it just outside the cuts
-    let bounded = Bounded::new(field, &contours.cuts, 4.0 * contours.pixel_mm);
-    let (rough, _) = surface::polygonise(&bounded, f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+    let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
     let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
     let settings = RemeshSettings {
         edge_mm: plan.surface.edge_mm,
