@@ -56,8 +56,7 @@ const TENTHS: f64 = 10.0;
 const DEEP: u8 = 30;
 /// The ring of surroundings, tenths of a pixel: a point spread of .6 px has let go of 99.9 % of the lumen at 2 px.
 const RING: (u8, u8) = (20, 42);
-/// Narrowest Gaussian of the inside values, mm: below it the noise of a lumen of 2 mm radius passes 1 % of contrast; at
-/// 3 mm a vessel that fades to .4 within 35 mm comes out 1.4 % too small in area, because the mean is one-sided at its end.
+/// Narrowest Gaussian of the inside values, mm: at 3 mm a vessel that fades to .4 within 35 mm comes out 1.4 % too small in area, because the mean is one-sided at its end.
 const INSIDE_MM: f64 = 2.0;
 /// Narrowest Gaussian of the outside values, mm: tissue on one side of a vessel and air on the other stay apart.
 const OUTSIDE_MM: f64 = 2.0;

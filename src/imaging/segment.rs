@@ -66,7 +66,7 @@ const SEARCH_MM: f64 = 0.9;
 const AMBIGUOUS: f64 = 0.6;
 /// Room around the lumen for its surroundings and growth: pixels in plane, slices across.
 const MARGIN: [usize; 3] = [24, 24, 4];
-/// The contrast of a vessel in raw noise deviations; noise alone gives its own dense spots less than 2.
+/// Least contrast of a vessel in raw noise deviations.
 const LEAST_CONTRAST: f64 = 3.0;
 /// Growth of the volume above which the lumen may have run over into a neighbour.
 const LEAK: f64 = 6.0;
