@@ -56,8 +56,8 @@ const TENTHS: f64 = 10.0;
 const DEEP: u8 = 30;
 /// The ring of surroundings, tenths of a pixel: a point spread of .6 px has let go of 99.9 % of the lumen at 2 px.
 const RING: (u8, u8) = (20, 42);
-/// Narrowest Gaussian of the inside values, mm: below it the noise of a lumen of 2 mm radius passes 1 % of contrast.
-const INSIDE_MM: f64 = 3.0;
+/// Narrowest Gaussian of the inside values, mm: at 3 mm a vessel that fades to .4 within 35 mm comes out 1.4 % too small in area, because the mean is one-sided at its end.
+const INSIDE_MM: f64 = 2.0;
 /// Narrowest Gaussian of the outside values, mm: tissue on one side of a vessel and air on the other stay apart.
 const OUTSIDE_MM: f64 = 2.0;
 /// Gaussian of the wide inside values, mm.
@@ -263,7 +263,7 @@ fn linear(coarse: &[[f32; 2]], m: [usize; 3], p: [usize; 3]) -> [f32; 2] {
         let (mut weight, mut i, mut stride) = (1.0, 0, 1);
         for a in 0..3 {
             // the nearer centre counts 3/4, the one on the fine cell's side 1/4
-            let side = if p[a] % 2 == 0 { (p[a] / 2).saturating_sub(1) } else { (p[a] / 2 + 1).min(m[a] - 1) };
+            let side = if p[a].is_multiple_of(2) { (p[a] / 2).saturating_sub(1) } else { (p[a] / 2 + 1).min(m[a] - 1) };
             let (at, w) = if corner >> a & 1 == 0 { (p[a] / 2, 0.75) } else { (side, 0.25) };
             i += stride * at;
             stride *= m[a];

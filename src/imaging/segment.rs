@@ -66,7 +66,7 @@ const SEARCH_MM: f64 = 0.9;
 const AMBIGUOUS: f64 = 0.6;
 /// Room around the lumen for its surroundings and growth: pixels in plane, slices across.
 const MARGIN: [usize; 3] = [24, 24, 4];
-/// The contrast of a vessel in raw noise deviations; noise alone gives its own dense spots less than 2.
+/// Least contrast of a vessel in raw noise deviations.
 const LEAST_CONTRAST: f64 = 3.0;
 /// Growth of the volume above which the lumen may have run over into a neighbour.
 const LEAK: f64 = 6.0;
@@ -95,7 +95,8 @@ pub fn segment(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<Segmenta
     };
     ctx.progress(0.2);
     let search_noise = noise.max(spread(&flat, noise));
-    let found = wanted(stack, settings, &flat, search_noise, bin, ctx)?;
+    let search = Search { flat, bin, noise: search_noise };
+    let found = wanted(stack, settings, &search, ctx)?;
     ctx.progress(0.5);
     let Some(best) = found.first() else {
         let reason = format!(
@@ -103,10 +104,10 @@ pub fn segment(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<Segmenta
         );
         return Err(Error::NoVessel { reason });
     };
-    let mut out = outlined(stack, settings, &smooth, &flat, best, bin, noise, &ctx.part(0.5, 1.0))?;
+    let mut out = outlined(stack, settings, (&smooth, noise), &search, best, &ctx.part(0.5, 1.0))?;
     out.noise = raw_noise;
     accepted(&out)?;
-    out.candidates = found.iter().map(|c| vessel(stack, &flat, c, bin)).collect();
+    out.candidates = found.iter().map(|c| vessel(stack, &search.flat, c, bin)).collect();
     ambiguity(&mut out, settings);
     ctx.progress(1.0);
     Ok(out)
@@ -145,15 +146,20 @@ fn spread(flat: &Volume, noise: f64) -> f64 {
     (1.4826 * median(&mut off)).min(3.0 * noise)
 }
 
-/// The candidates that the settings ask for, best first.
-fn wanted(
-    stack: &Stack,
-    settings: &Settings,
-    flat: &Volume,
-    noise: f64,
+/// The volume in which the vessel is searched.
+struct Search {
+    /// Denoised, binned, without its background.
+    flat: Volume,
+    /// Pixels per cell along each in-plane axis.
     bin: usize,
-    ctx: &Ctx,
-) -> Result<Vec<Candidate>, Error> {
+    /// Noise or texture, standard deviation.
+    noise: f64,
+}
+
+/// The candidates that the settings ask for, best first.
+fn wanted(stack: &Stack, settings: &Settings, search: &Search, ctx: &Ctx) -> Result<Vec<Candidate>, Error> {
+    let Search { flat, bin, noise } = search;
+    let (bin, noise) = (*bin, *noise);
     let index = |x: f64, y: f64, z: usize| {
         let [x, y] = [x, y].map(|p| ((p + 0.5) / bin as f64 - 0.5).round());
         let inside = x >= 0.0 && y >= 0.0 && x < flat.n[0] as f64 && y < flat.n[1] as f64;
@@ -194,17 +200,16 @@ fn wanted(
 }
 
 /// The candidate at full resolution, grown under its local levels.
-#[allow(clippy::too_many_arguments)]
 fn outlined(
     stack: &Stack,
     settings: &Settings,
-    smooth: &Volume,
-    flat: &Volume,
+    (smooth, noise): (&Volume, f64),
+    search: &Search,
     best: &Candidate,
-    bin: usize,
-    noise: f64,
     ctx: &Ctx,
 ) -> Result<Segmentation, Error> {
+    let Search { flat, bin, .. } = search;
+    let bin = *bin;
     let mut seed = Vec::with_capacity(best.voxels.len() * bin * bin);
     for &i in &best.voxels {
         let p = position(i as usize, flat.n, bin);

@@ -2,8 +2,8 @@
 //!
 //! Uniform cubic B-splines over a closed parameter. [`PeriodicSpline::through`] interpolates points that are about
 //! equally spaced along the curve and then brings the parameter to arc length: the curve is sampled densely, its length
-//! table inverted, and the points at equal arc length interpolated anew, so that |x'(s)| is within 1 % of 1 (1e-4 on a
-//! circle of 32 knots). Fitting noisy points is [`crate::smooth`]'s part.
+//! table inverted, and the points at equal arc length interpolated anew, with more knots where the curve bends sharply,
+//! so that |x'(s)| is within 1 % of 1. Fitting noisy points is [`crate::smooth`]'s part.
 
 /// A closed planar curve, C2, parametrised by arc length (to the accuracy of its knots), mm.
 #[derive(Clone, Debug)]
@@ -12,11 +12,11 @@ pub struct PeriodicSpline {
     control: Vec<[f64; 2]>,
 }
 
-/// Samples per knot interval of the length table: chords then miss 1e-5 of the length at 8 knots per turn.
+/// Samples per knot interval of the length table, each by Simpson's rule.
 const LENGTH_SAMPLES: usize = 16;
 /// Deviation of |x'| from 1 that asks for more knots; 1 % is promised.
 const SPEED_ERROR: f64 = 0.005;
-/// Fewest knots: a circle through 8 knots is round to 1e-3 of its radius.
+/// Fewest knots.
 const MIN_KNOTS: usize = 8;
 
 impl PeriodicSpline {

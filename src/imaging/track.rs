@@ -103,7 +103,10 @@ impl Step<'_> {
         if !overlap {
             let place = self.place(low + self.k, o);
             if let Some(message) = self.continuation(&inside, &away, half_width) {
-                out.warnings.push(Warning::new("contours.no_overlap", message, place));
+                // the way down meets the same pair again
+                if self.next > self.k {
+                    out.warnings.push(Warning::new("contours.no_overlap", message, place));
+                }
                 return;
             }
             if self.gap {

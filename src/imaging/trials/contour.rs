@@ -122,3 +122,19 @@ fn peanuts_keep_their_waist() {
     }
     assert!(worst <= 1.0, "{worst}");
 }
+
+#[test]
+fn the_blur_of_a_disc_is_read_from_its_pixels() {
+    let d = |x: f64, y: f64| (x - 20.2).hypot(y - 19.7) - 7.5;
+    // distances are counted from the half-maximum contour, (.36 + 1/12) / (2 r) inside the wall
+    let shift = (0.36 + 1.0 / 12.0) / 15.0;
+    let profile = image(d)
+        .iter()
+        .enumerate()
+        .map(|(k, v)| (-d((k % N) as f64, (k / N) as f64) - shift, *v))
+        .filter(|(d, _)| d.abs() < 2.0)
+        .collect();
+    let s = crate::smooth::blur(&profile, 0.1, 3.0).unwrap();
+    println!("blur {s:.4}, sigma {:.4}", (s * s - 1.0 / 12.0).sqrt());
+    assert!((s * s - 0.36 - 1.0 / 12.0).abs() < 0.02, "{s}");
+}

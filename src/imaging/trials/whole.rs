@@ -51,9 +51,9 @@ fn a_fork_is_found_whole() {
     assert!(r.warnings.is_empty(), "{:?}", r.warnings);
     let (rms, mean) = error(&c, &fork(), JUNCTION);
     println!("fork: rms {rms:.4} mean {mean:+.4} mm, psf {:?}", r.psf_sigma_px);
-    // .6 mm pixels: .05 px rms and .01 px mean
-    assert!(rms < 0.03 && mean.abs() < 0.006, "{rms} {mean}");
-    assert!((r.psf_sigma_px.unwrap() - 0.59).abs() < 0.06, "{:?}", r.psf_sigma_px);
+    // the bars of a disc of 5 px at SNR 20: .06 px rms, .6 % of area
+    assert!(rms < 0.036 && mean.abs() < 0.009, "{rms} {mean}");
+    assert!((r.psf_sigma_px.unwrap() - 0.6).abs() < 0.06, "{:?}", r.psf_sigma_px);
     assert!((r.threshold - 60.0).abs() < 1.0, "{}", r.threshold);
 }
 
@@ -75,7 +75,9 @@ fn distractors_bias_and_bright_tissue_change_nothing() {
             r.psf_sigma_px
         );
         forked(&r);
-        assert!(rms < 0.6 * (0.03 + 1.2 / snr) && mean.abs() < 0.02, "{seed}: {rms} {mean}");
+        // area bias 2 r mean: 2 % at SNR 10 (issue B), less above
+        let most = if snr < 10.0 { 0.03 } else { 0.015 };
+        assert!(rms < 0.6 * (0.03 + 1.2 / snr) && mean.abs() < most, "{seed}: {rms} {mean}");
         assert!(!codes(&r).contains(&"segmentation.leak"));
     }
 }
@@ -87,7 +89,8 @@ fn a_fading_vessel_is_followed() {
     forked(&r);
     let (rms, mean) = error(&c, &fork(), JUNCTION);
     println!("fade: rms {rms:.4} mean {mean:+.4}");
-    assert!(rms < 0.07 && mean.abs() < 0.02, "{rms} {mean}");
+    // SNR falls to 10: .138 px
+    assert!(rms < 0.083 && mean.abs() < 0.02, "{rms} {mean}");
 }
 
 #[test]
@@ -123,7 +126,7 @@ fn a_gap_is_kept_and_said() {
     assert_eq!(codes(&r), vec!["stack.gap", "stack.gap"]);
     assert_eq!((c.planes.len(), r.lumens.len(), c.tips.len()), (22, 22, 0));
     assert!((c.planes[5].origin.z() - 9.0).abs() < 1e-9);
-    assert!(error(&c, &fork(), JUNCTION).0 < 0.03);
+    assert!(error(&c, &fork(), JUNCTION).0 < 0.036);
 }
 
 #[test]
@@ -251,4 +254,15 @@ fn random_values_without_structure_are_refused() {
     let mut stack = Scan::new(fork()).stack();
     stack.pixels.iter_mut().for_each(|p| *p = (100.0 * n.uniform()) as f32);
     assert_eq!(run(&stack, &Settings::default()).unwrap_err().code(), "segmentation.no_vessel");
+}
+
+#[test]
+fn the_point_spread_is_read_from_the_edges() {
+    for noise in [0.3, 2.0, 5.0] {
+        let tube = vec![([28.5, 28.5, -10.0], [30.0, 29.5, 50.0], 4.0)];
+        let (c, r) = auto(&Scan { noise, ..Scan::new(tube.clone()) });
+        let sigma = r.psf_sigma_px.unwrap();
+        println!("noise {noise}: psf {sigma:.4} {:?} {:?}", error(&c, &tube, [0.0; 3]), r.threshold);
+        assert!((sigma - 0.6).abs() < 0.06, "{noise} {sigma}");
+    }
 }
