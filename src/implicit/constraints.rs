@@ -256,7 +256,7 @@ fn push_closing(contours: &Contours, c: &mut Constraints) {
     let mut push = |position: P3, depth: f64| {
         c.points.push(position);
         c.values.push(-depth);
-        c.sigma_mm.push(0.5 * depth);
+        c.sigma_mm.push(0.5 * depth.abs());
     };
     for tip in &contours.tips {
         push(tip.position + tip.outward * contours.pixel_mm, contours.pixel_mm);
@@ -276,8 +276,21 @@ fn push_closing(contours: &Contours, c: &mut Constraints) {
             if let Some(at) = touching {
                 push(at + cut.outward * (2.0 * radius), radius);
             }
+            // what closes the end must not open the middle of a wide lumen, where no wall point speaks
+            if parallel && touching.is_some() && is_inside(plane, &samples, centre) {
+                push(centre, -0.5 * radius);
+            }
         }
     }
+}
+
+/// Whether a point of the plane lies within a closed polygon (crossing number).
+fn is_inside(plane: &Plane, polygon: &[P3], point: P3) -> bool {
+    let o = plane.in_plane(point);
+    let corners: Vec<[f64; 2]> = polygon.iter().map(|&p| plane.in_plane(p)).collect();
+    let crossings =
+        (0..corners.len()).filter(|&k| crossing(o, [1.0, 0.0], corners[k], corners[(k + 1) % corners.len()]).is_some());
+    crossings.count() % 2 == 1
 }
 
 /// Middle of a curve's parcel along the image border.

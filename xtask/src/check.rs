@@ -55,7 +55,12 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     let python = tools::python()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
-        judge.arg(script).env("VASCULUM_BIN", binary).env("VASCULUM_OUT", &out).env("VASCULUM_SCAN", &scan);
+        judge
+            .arg(script)
+            .env("VASCULUM_ROOT", shell::root()?)
+            .env("VASCULUM_BIN", binary)
+            .env("VASCULUM_OUT", &out)
+            .env("VASCULUM_SCAN", &scan);
         shell::run(judge)?;
     }
     let node = tools::node_packages()?;

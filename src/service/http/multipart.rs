@@ -35,8 +35,8 @@ pub(super) struct Budget {
 }
 
 impl Budget {
-    /// Takes what `more` bytes need.
-    fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
+    /// Counts what was sent against the largest body.
+    fn count(&mut self, state: &State, more: usize) -> Result<(), Problem> {
         self.bytes += more as u64;
         if self.bytes > state.config.max_body {
             return Err(Problem::new(
@@ -45,6 +45,12 @@ impl Budget {
                 format!("The upload is larger than {} bytes, the most that this service takes.", state.config.max_body),
             ));
         }
+        Ok(())
+    }
+
+    /// Takes what `more` bytes need.
+    fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
+        self.count(state, more)?;
         while (self.permits.len() as u64) * UPLOAD_UNIT < self.bytes {
             match state.uploads.clone().try_acquire_owned() {
                 Ok(permit) => self.permits.push(permit),
@@ -69,12 +75,20 @@ impl Budget {
 pub(super) async fn read(state: &State, mut form: Multipart) -> Result<Upload, Problem> {
     let mut upload = Upload { plan: "{}".to_owned(), files: Vec::new(), budget: Budget::default() };
     let mut plans = 0;
+    // A client that is still sending sees a broken pipe instead of an early answer: what follows a refused plan is read
+    // and dropped, within the same limit.
+    let mut refused: Option<Problem> = None;
+    let mut dropped = Budget::default();
     while let Some(field) = form.next_field().await.map_err(broken)? {
         match field.name() {
             Some("plan") => {
                 plans += 1;
-                upload.plan = plan(state, field, &mut upload.budget).await?;
+                match plan(state, field, &mut upload.budget).await {
+                    Ok(text) => upload.plan = text,
+                    Err(problem) => refused = refused.or(Some(problem)),
+                }
             }
+            Some("input") if refused.is_some() => skip(state, field, &mut dropped).await?,
             Some("input") => {
                 if upload.files.len() == MOST_PARTS {
                     return Err(Problem::new(
@@ -90,10 +104,21 @@ pub(super) async fn read(state: &State, mut form: Multipart) -> Result<Upload, P
             other => return Err(unknown_part(other.unwrap_or(""))),
         }
     }
+    if let Some(problem) = refused {
+        return Err(problem);
+    }
     if plans > 1 {
         return Err(Problem::new(StatusCode::BAD_REQUEST, "upload.part", "The upload has more than one part `plan`."));
     }
     Ok(upload)
+}
+
+/// Reads a part without keeping it.
+async fn skip(state: &State, mut field: Field<'_>, dropped: &mut Budget) -> Result<(), Problem> {
+    while let Some(chunk) = field.chunk().await.map_err(broken)? {
+        dropped.count(state, chunk.len())?;
+    }
+    Ok(())
 }
 
 fn unknown_part(name: &str) -> Problem {
