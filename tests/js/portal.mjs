@@ -17,12 +17,14 @@ const fail = (why) => {
 };
 const address = await new Promise((resolve) => {
   let text = "";
+  const late = setTimeout(() => fail("the service does not listen"), 20000);
   server.stdout.on("data", (chunk) => {
     text += chunk;
     const found = text.match(/listening on (http:\/\/\S+)/);
-    if (found) resolve(found[1]);
+    if (!found) return;
+    clearTimeout(late);
+    resolve(found[1]);
   });
-  setTimeout(() => fail("the service does not listen"), 20000).unref();
 });
 const form = new FormData();
 form.append("plan", new Blob([readFileSync(join(scan, "plan.json"))]));
@@ -44,8 +46,8 @@ page.on("console", (m) => m.type() === "error" && faults.push(m.text()));
 page.on("pageerror", (e) => faults.push(String(e)));
 page.on("request", (r) => !r.url().startsWith(address) && !r.url().startsWith("blob:") && !r.url().startsWith("data:") && faults.push(`foreign request ${r.url()}`));
 await page.goto(`${address}/#/jobs/${job.id}`);
-for (const name of ["graft_proximal", "graft_distal_planar", "distal_normal"]) {
-  await page.getByText(name, { exact: false }).first().waitFor({ timeout: 20000 });
+for (const name of ["Graft – proximal", "Graft – distal, in the plane", "Distal – normal of the plane"]) {
+  await page.getByText(name, { exact: true }).first().waitFor({ timeout: 20000 }).catch(() => fail(`the result view does not show ${name}`));
 }
 await page.waitForTimeout(3000);
 await page.screenshot({ path: join(work, "portal.png") });
