@@ -78,9 +78,11 @@ fn smallest_spur(graph: &MedialGraph, lumen: &Lumen<'_>, caps: &Caps, settings: 
     let size = |e: usize| {
         let [junction, tip] = leaf(graph, &degree, e)?;
         let stretch = graph.nodes[junction].position.distance(graph.nodes[tip].position);
-        let radii = stretch / graph.nodes[junction].radius_mm.max(f64::MIN_POSITIVE);
-        let at_cap = caps.has_near(graph.nodes[tip].position, lumen);
-        let spur = if at_cap { settings.prune_radii.max(RIM_RADII) } else { settings.prune_radii };
+        // at an oblique cap the junction of a rim spur may itself lie in the wedge, where spheres are small
+        let cap_radius = caps.near_radius(graph.nodes[tip].position, lumen);
+        let radius = graph.nodes[junction].radius_mm.max(cap_radius.unwrap_or(0.0));
+        let radii = stretch / radius.max(f64::MIN_POSITIVE);
+        let spur = if cap_radius.is_some() { settings.prune_radii.max(RIM_RADII) } else { settings.prune_radii };
         (radii < spur && !kept.contains(&Some(tip))).then_some((radii, e))
     };
     (0..graph.edges.len()).filter_map(size).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, e)| e)
@@ -142,12 +144,13 @@ impl Caps {
         self.caps.iter()
     }
 
-    /// Whether a point lies in the first reach of a cap and sees it.
-    fn has_near(&self, x: P3, lumen: &Lumen<'_>) -> bool {
+    /// The inscribed radius at the cap in whose first reach a point lies and that it sees; the largest of several.
+    fn near_radius(&self, x: P3, lumen: &Lumen<'_>) -> Option<f64> {
         let slack = 2.0 * lumen.spacing_mm();
-        self.caps.iter().any(|(cap, radius)| {
+        let near = self.caps.iter().filter(|(cap, radius)| {
             x.distance(cap.centroid) <= REACH[0] * radius + slack && lumen.sees(x, inner(cap, lumen))
-        })
+        });
+        near.map(|(_, radius)| *radius).max_by(f64::total_cmp)
     }
 
     /// For each cap the end node that meets it: greedily the pair whose inscribed sphere comes nearest to the centroid,
