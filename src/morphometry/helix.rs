@@ -16,7 +16,7 @@ use crate::types::Helix;
 /// the torsion, is not told by points with an error of a hundredth of the radius.
 const BEND_MIN: f64 = 0.35;
 /// The points must lie this many times further (root mean square) from the best straight line than from the helix. A
-/// short line of pure noise reaches 1.4, because a tight helix follows some of it.
+/// tight helix follows some of a short line of pure noise, so that 1 is not enough; the value is not yet swept.
 const STRAIGHT_RATIO: f64 = 3.0;
 /// Fewest points.
 const POINTS_MIN: usize = 12;

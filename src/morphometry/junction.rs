@@ -9,10 +9,9 @@ use crate::fit::{FittedLine, fit_line, meeting_point};
 use crate::track::Track;
 use space::{DVec3, P3, V3};
 
-/// Window start in crotch distances; at 1.0 the 45 degree anastomosis is still off by .3 degree on smoothed fields.
+/// Window start in crotch distances: within one of them the lumens overlap. The factor is a choice, not yet swept.
 pub(crate) const FROM_CROTCH: f64 = 1.3;
-/// A window shorter than this many diameters gives no line: at 0.5 diameters and .02 mm of noise in the medial line a
-/// direction is uncertain by more than half a degree.
+/// A window shorter than this many diameters gives no line. The value is a choice, not yet swept.
 pub(crate) const WINDOW_MIN: f64 = 1.0;
 /// Where the crotch reaches so far that the wanted window is shorter than this, its end is moved out.
 const WINDOW_WANTED: f64 = 1.5;
