@@ -3,13 +3,14 @@
 //! A global level errs wherever coil sensitivity, inflow or the tissue around change: the half-way level between the
 //! lumen and its surroundings is taken at every voxel instead. Inside: raw grey values of the mask, weighted by the cube
 //! of their depth (up to 3 px), so that the blurred rim does not pull the value down. Outside: raw values 2 to 4 px away
-//! from the mask, those within 2 px of other bright structures left out. Both are spread by normalised convolution with
+//! from the mask, those within 2 px of other bright structures left out, and those that the mask surrounds: where noise hollows
+//! a faded lumen out, its own grey values would lift the level and keep the hollow open (seen on a real aorta). Both are spread by normalised convolution with
 //! Gaussians of growing width, so that near data decide where there are any. The mask then grows (or shrinks) to the
 //! component above the level within reach, and the levels are taken anew until nothing changes: a vessel is followed as
 //! far as its own contrast carries it.
 
 use crate::Error;
-use crate::region::{FAR, distances, reached};
+use crate::region::{FAR, distances, reached, surrounded};
 use exec::Ctx;
 
 /// A box of the stack with what the growth needs; index = x + n[0] * (y + n[1] * z).
@@ -106,8 +107,11 @@ impl Patch {
             // a voxel beside the boundary is half a pixel deep
             t => (f32::from(t.saturating_sub(5).min(DEEP)) / f32::from(DEEP)).powi(3),
         };
+        // widened by 2 px, so that a crack does not open a hollow
+        let widened: Vec<bool> = d[0].iter().map(|&t| t < RING.0).collect();
+        let within = surrounded(&widened, self.n);
         let ring = |i: usize| match (d[0][i], d[2][i]) {
-            (t, FAR) if (RING.0..=RING.1).contains(&t) => 1.0,
+            (t, FAR) if (RING.0..=RING.1).contains(&t) && !within[i] => 1.0,
             _ => 0.0,
         };
         let inside = self.spread(depth, INSIDE_MM, ctx)?;

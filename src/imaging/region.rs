@@ -78,6 +78,35 @@ pub(crate) fn components(open: &mut [bool], n: [usize; 3], least: usize) -> Vec<
     out
 }
 
+/// Voxels outside a set that it surrounds within some slice of the lattice, whichever way that is cut: what lies within
+/// a section of a lumen, also where the lumen runs out of the lattice and the hollow with it.
+pub(crate) fn surrounded(set: &[bool], n: [usize; 3]) -> Vec<bool> {
+    let stride = [1, n[0], n[0] * n[1]];
+    let mut out = vec![false; set.len()];
+    for across in 0..3 {
+        let [a, b] = [(across + 1) % 3, (across + 2) % 3];
+        let (mut open, mut todo) = (vec![false; n[a] * n[b]], Vec::new());
+        for k in 0..n[across] {
+            let at = |i: usize| k * stride[across] + i % n[a] * stride[a] + i / n[a] * stride[b];
+            open.iter_mut().enumerate().for_each(|(i, o)| *o = !set[at(i)]);
+            todo.extend((0..n[a]).flat_map(|i| [i, i + n[a] * (n[b] - 1)]));
+            todo.extend((0..n[b]).flat_map(|j| [n[a] * j, n[a] * j + n[a] - 1]));
+            while let Some(i) = todo.pop() {
+                if !std::mem::replace(&mut open[i], false) {
+                    continue;
+                }
+                let (x, y) = (i % n[a], i / n[a]);
+                todo.extend((x > 0).then(|| i - 1));
+                todo.extend((x + 1 < n[a]).then(|| i + 1));
+                todo.extend((y > 0).then(|| i - n[a]));
+                todo.extend((y + 1 < n[b]).then(|| i + n[a]));
+            }
+            (0..open.len()).filter(|&i| open[i]).for_each(|i| out[at(i)] = true);
+        }
+    }
+    out
+}
+
 /// Distance value of voxels farther than the limit.
 pub(crate) const FAR: u8 = u8::MAX;
 
@@ -128,6 +157,18 @@ mod tests {
         let at = |x: usize, y: usize, z: usize| d[x + 9 * (y + 5 * z)];
         assert_eq!([at(0, 2, 1), at(3, 2, 1), at(4, 2, 1), at(5, 2, 1)], [0, 30, 40, FAR]);
         assert_eq!([at(1, 3, 1), at(0, 2, 2), at(1, 2, 0)], [14, 30, 32]);
+    }
+
+    #[test]
+    fn a_hollow_that_runs_out_of_the_lattice_is_surrounded_and_a_groove_is_not() {
+        let n = [5, 5, 4];
+        let index = |x: usize, y: usize, z: usize| x + 5 * (y + 5 * z);
+        let ring = |x: usize, y: usize| (1..4).contains(&x) && (1..4).contains(&y) && (x, y) != (2, 2);
+        let mut set: Vec<bool> = (0..100).map(|i| ring(i % 5, i / 5 % 5)).collect();
+        let within: Vec<usize> = (0..100).filter(|&i| surrounded(&set, n)[i]).collect();
+        assert_eq!(within, [0, 1, 2, 3].map(|z| index(2, 2, z)));
+        (0..4).for_each(|z| set[index(3, 2, z)] = false);
+        assert!(!surrounded(&set, n).contains(&true));
     }
 
     #[test]
