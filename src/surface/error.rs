@@ -142,13 +142,13 @@ pub enum Error {
         /// A place of the densest mesh.
         at: P3,
     },
-    /// The harmonic functions of the patches did not converge.
-    #[error("the patch equations stopped at a relative residual of {residual:e} after {iterations} iterations")]
+    /// The harmonic functions of the patches have no solution.
+    #[error("the patch equations of {unknowns} vertices cannot be solved ({reason}): remesh with another edge_mm")]
     PatchSolve {
-        /// Iterations taken.
-        iterations: usize,
-        /// |r| / |b|.
-        residual: f64,
+        /// Vertices without a given value.
+        unknowns: usize,
+        /// What the factorisation said.
+        reason: String,
     },
     /// The list of patch ids does not fit the caps.
     #[error("{ids} patch ids were given for {caps} caps: one id per cap, in the order of their face ids")]
