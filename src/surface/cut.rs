@@ -12,7 +12,7 @@
 
 use crate::cap::{Rim, close};
 use crate::fabric::Fabric;
-use crate::improve::{collapse_short, flip_to_valence};
+use crate::improve::thin_out;
 use crate::land::{Approach, Flat, Tie, land, landed};
 use crate::topology::regions;
 use crate::web::Web;
@@ -108,16 +108,7 @@ fn tidy(mesh: &TriMesh, field: &dyn Field, ctx: &Ctx) -> Result<TriMesh, Error> 
     let mut wall = mesh.clone();
     wall.face_id.fill(WALL);
     let mut fabric = Fabric::new(&wall, field, Vec::new())?;
-    for t in 0..wall.triangles.len() {
-        let normal = wall.area_vector(t).raw();
-        wall.triangles[t].iter().for_each(|&v| fabric.gradient[v as usize] -= normal);
-    }
-    let (sum, count) = fabric.edges().fold((0.0, 0_u32), |(s, n), h| (s + fabric.web.length(h), n + 1));
-    fabric.size.fill(sum / f64::from(count.max(1)));
-    for _ in 0..2 {
-        collapse_short(&mut fabric, ctx)?;
-        flip_to_valence(&mut fabric, ctx)?;
-    }
+    thin_out(&mut fabric, 1.0, ctx)?;
     Ok(fabric.web.mesh())
 }
 
