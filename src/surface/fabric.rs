@@ -197,6 +197,12 @@ impl<'a> Fabric<'a> {
         (0..self.web.origin.len() as u32).filter(|&h| self.web.lives(h) && h < self.web.twin[h as usize])
     }
 
+    /// Mean length of the living edges, mm.
+    pub(crate) fn mean_edge(&self) -> f64 {
+        let (sum, count) = self.edges().fold((0.0, 0_u32), |(s, n), h| (s + self.web.length(h), n + 1));
+        sum / f64::from(count.max(1))
+    }
+
     /// Wanted length of an edge.
     pub(crate) fn wanted(&self, h: u32) -> f64 {
         let (a, b) = (self.web.origin[h as usize] as usize, self.web.target(h) as usize);

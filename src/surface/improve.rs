@@ -69,15 +69,34 @@ fn excess(fabric: &Fabric<'_>, h: u32) -> Option<f64> {
 
 /// Collapse edges that are too short, the shortest first.
 pub(crate) fn collapse_short(fabric: &mut Fabric<'_>, ctx: &Ctx) -> Result<usize, Error> {
+    collapse_below(fabric, SHORT, |_, _| true, ctx)
+}
+
+/// Collapse rim edges shorter than `part` of the mesh's mean edge.
+pub(crate) fn collapse_curves(fabric: &mut Fabric<'_>, part: f64, ctx: &Ctx) -> Result<usize, Error> {
+    /// Wall edges next to a fresh rim may be longer than the mean: only rims are to be judged by length.
+    const AMPLE: f64 = 10.0;
+    let size = AMPLE * fabric.mean_edge();
+    fabric.size.fill(size);
+    collapse_below(fabric, part / AMPLE, |fabric, h| fabric.web.is_feature(h), ctx)
+}
+
+fn collapse_below(
+    fabric: &mut Fabric<'_>,
+    least: f64,
+    of: impl Fn(&Fabric<'_>, u32) -> bool,
+    ctx: &Ctx,
+) -> Result<usize, Error> {
     let ratio = |fabric: &Fabric<'_>, h: u32| fabric.web.length(h) / fabric.wanted(h);
-    let mut short: Vec<(f64, u32)> = fabric.edges().map(|h| (ratio(fabric, h), h)).filter(|e| e.0 < SHORT).collect();
+    let edges = fabric.edges().filter(|&h| of(fabric, h));
+    let mut short: Vec<(f64, u32)> = edges.map(|h| (ratio(fabric, h), h)).filter(|e| e.0 < least).collect();
     short.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
     let mut count = 0;
     for (i, (_, h)) in short.into_iter().enumerate() {
         if i % BETWEEN_CHECKS == 0 {
             ctx.check()?;
         }
-        if !fabric.web.lives(h) || ratio(fabric, h) >= SHORT {
+        if !fabric.web.lives(h) || ratio(fabric, h) >= least {
             continue;
         }
         for way in [h, fabric.web.twin[h as usize]] {
@@ -94,8 +113,8 @@ pub(crate) fn collapse_short(fabric: &mut Fabric<'_>, ctx: &Ctx) -> Result<usize
 /// Draw the slivers of a raw lattice mesh together: edges shorter than `times` the mean collapse onto vertices that
 /// stay, no evaluation of f. Sizes are that length afterwards.
 pub(crate) fn thin_out(fabric: &mut Fabric<'_>, times: f64, ctx: &Ctx) -> Result<(), Error> {
-    let (sum, count) = fabric.edges().fold((0.0, 0_u32), |(s, n), h| (s + fabric.web.length(h), n + 1));
-    fabric.size.fill(times * sum / f64::from(count.max(1)));
+    let size = times * fabric.mean_edge();
+    fabric.size.fill(size);
     for _ in 0..2 {
         collapse_short(fabric, ctx)?;
         flip_to_valence(fabric, ctx)?;

@@ -59,7 +59,6 @@ impl Line {
             && q.max_angle_deg <= 120.0
             && q.vertex_max_mm <= 1e-9
             && self.calls() <= 6.0
-           
     }
     fn show(&self) {
         let (q, r) = (&self.quality, &self.report);
