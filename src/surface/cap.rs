@@ -3,10 +3,13 @@
 //! A constrained Delaunay triangulation of the rim's vertices in the cap's plane (crate spade, exact predicates), of
 //! which the triangles inside the loop are kept. No vertex is added, so rim edges are shared exactly.
 
+use crate::cut::loops;
 use crate::land::Flat;
-use crate::{Error, TriMesh};
+use crate::web::{NONE, Web};
+use crate::{Error, TriMesh, WALL};
 use space::P3;
 use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
+use std::collections::BTreeMap;
 
 /// A closed loop of rim vertices, counterclockwise about the plane's outward normal.
 pub(crate) struct Rim {
@@ -39,8 +42,40 @@ impl Outline {
     }
 }
 
+/// The mesh with every cap triangulated anew from its rim alone; vertices inside caps are dropped. The cap of plane k has
+/// face id k + 1.
+///
+/// # Errors
+/// [`Error::NestedRims`], [`Error::CrossedRim`].
+pub(crate) fn recap(web: &Web, flats: &[Flat]) -> Result<TriMesh, Error> {
+    let mut number = vec![NONE; web.at.len()];
+    let mut mesh = TriMesh::default();
+    let kept: Vec<usize> = (0..web.face_id.len()).filter(|&t| web.face_id[t] == WALL).collect();
+    let edges: Vec<u32> =
+        (0..web.origin.len() as u32).filter(|&h| web.lives(h) && web.id(h) != WALL && web.is_feature(h)).collect();
+    let used = kept.iter().flat_map(|&t| web.corners(t)).chain(edges.iter().map(|&h| web.origin[h as usize]));
+    for v in used {
+        if number[v as usize] == NONE {
+            number[v as usize] = mesh.vertices.len() as u32;
+            mesh.vertices.push(P3::from_raw(web.at[v as usize]));
+        }
+    }
+    for &t in &kept {
+        mesh.triangles.push(web.corners(t).map(|v| number[v as usize]));
+        mesh.face_id.push(WALL);
+    }
+    for (plane, flat) in flats.iter().enumerate() {
+        let boundary: BTreeMap<u32, u32> = (edges.iter().filter(|&&h| web.id(h) as usize == plane + 1))
+            .map(|&h| (number[web.origin[h as usize] as usize], number[web.target(h) as usize]))
+            .collect();
+        let rims: Vec<Rim> = loops(&boundary).into_iter().map(|vertices| Rim { vertices, plane }).collect();
+        close(&mut mesh, &rims, flat)?;
+    }
+    Ok(mesh)
+}
+
 /// Close every rim of one plane.
-pub(crate) fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<(), Error> {
+fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<(), Error> {
     let (e, f) = plane.normal.any_orthonormal_pair();
     // (e, f, normal) right-handed, so that counterclockwise in the plane faces outward.
     let f = if e.cross(f).dot(plane.normal) < 0.0 { -f } else { f };
@@ -57,8 +92,9 @@ pub(crate) fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<()
     for (i, rim) in rims.iter().enumerate() {
         let at = mesh.vertices[rim.vertices[0] as usize];
         let nested = (0..rims.len()).any(|j| j != i && outlines[j].holds(outlines[i].at[0]));
-        if nested || outlines[i].area() <= 0.0 {
-            return Err(Error::NestedRims { plane: rim.plane, at });
+        let area_mm2 = outlines[i].area();
+        if nested || area_mm2 <= 0.0 {
+            return Err(Error::NestedRims { plane: rim.plane, area_mm2: area_mm2.abs(), at });
         }
         let triangles = triangulate(&outlines[i]).ok_or(Error::CrossedRim { plane: rim.plane, at })?;
         for t in triangles {
@@ -87,20 +123,35 @@ fn triangulate(outline: &Outline) -> Option<Vec<[usize; 3]>> {
         }
         cdt.add_constraint(a, b);
     }
-    let mut triangles: Vec<[usize; 3]> = cdt
-        .inner_faces()
-        .map(|face| face.vertices().map(|v| v.fix().index()))
-        .filter(|t| {
-            let [p, q, r] = t.map(|k| outline.at[k]);
-            outline.holds([(p[0] + q[0] + r[0]) / 3.0, (p[1] + q[1] + r[1]) / 3.0])
-        })
-        .collect();
+    let faces: Vec<[usize; 3]> = cdt.inner_faces().map(|face| face.vertices().map(|v| v.fix().index())).collect();
+    let mut triangles = left_of_outline(&faces, n);
     triangles.iter_mut().for_each(|t| {
         let least = (0..3).min_by_key(|&k| t[k]).unwrap_or(0);
         t.rotate_left(least);
     });
     triangles.sort_unstable();
     (triangles.len() == n - 2).then_some(triangles)
+}
+
+/// The triangles left of the outline 0, 1, .. n - 1, by connection alone: a flat triangle along the outline has no
+/// centre whose side could be told by coordinates.
+fn left_of_outline(faces: &[[usize; 3]], n: usize) -> Vec<[usize; 3]> {
+    let mut face_at = BTreeMap::new();
+    for (f, t) in faces.iter().enumerate() {
+        (0..3).for_each(|k| _ = face_at.insert((t[k], t[(k + 1) % 3]), f));
+    }
+    let mut inside = vec![false; faces.len()];
+    let mut open: Vec<usize> = (0..n).filter_map(|i| face_at.get(&(i, (i + 1) % n)).copied()).collect();
+    while let Some(f) = open.pop() {
+        if std::mem::replace(&mut inside[f], true) {
+            continue;
+        }
+        let t = faces[f];
+        for (a, b) in (0..3).map(|k| (t[k], t[(k + 1) % 3])).filter(|&(a, b)| (a + 1) % n != b) {
+            open.extend(face_at.get(&(b, a)).filter(|&&o| !inside[o]));
+        }
+    }
+    faces.iter().zip(inside).filter(|(_, inside)| *inside).map(|(t, _)| *t).collect()
 }
 
 /// A field that closes itself a little outside some cut planes: min(f, `margin_mm` - distance outside).

@@ -1,18 +1,18 @@
 //! Cutting the closed wall where the data end, and closing it again with planar caps.
 //!
-//! One plane after the other, each for the whole mesh: what lies on its outward side goes. A vertex counts as inside
-//! only when it lies deeper than a fraction of its shortest edge, so no rim triangle starts as a sliver and a vertex
-//! exactly in the plane (grid-aligned phantoms) is no special case. Rim vertices are placed on the crossed edges and
-//! moved by Newton onto f = 0 within the plane; each rim loop is closed by a constrained Delaunay triangulation without
-//! further points. A later plane may cut an earlier cap (planes that meet at a corner of the volume inside a lumen): its
-//! rim then runs along the line of the two planes, and the corners lie on f = 0 and that line.
+//! One plane after the other, each for the whole mesh: what lies on its outward side goes. The section of the mesh itself
+//! is taken, straight across its triangles: the mesh does not pass through itself, so neither does its section, whatever
+//! the plane. Each opening gets a cap without geometry (a fan), rim edges much shorter than the mesh's collapse, and the
+//! rim is triangulated in its plane (constrained Delaunay). A later plane may cut an earlier cap (planes that meet at a
+//! corner of the volume inside a lumen). Only when all planes are done do rims move onto f = 0 within their planes.
 //!
-//! Rejected: clipping triangle by triangle with vertices snapped into the plane. Triangles with all corners in the plane
-//! are then ambiguous, and the Euler number of one grid-aligned tube in ten was wrong.
+//! Rejected: clipping triangle by triangle with vertices snapped into the plane (wrong Euler number for one grid-aligned
+//! tube in ten), and landing rim vertices on f while cutting: neighbours nearer to each other than the wall is to the
+//! mesh changed places, and the rim crossed itself in 3 of the first 40 phantoms of the survey.
 
-use crate::cap::{Rim, close};
+use crate::cap::recap;
 use crate::fabric::Fabric;
-use crate::improve::{collapse_short, flip_to_valence};
+use crate::improve::{collapse_curves, thin_out};
 use crate::land::{Approach, Flat, Tie, land, landed};
 use crate::topology::regions;
 use crate::web::Web;
@@ -52,10 +52,14 @@ pub struct CutReport {
     pub evaluations: usize,
 }
 
-/// A vertex is inside a plane when it is deeper than this fraction of its shortest edge; one nearer counts as outside
-/// by as much. Tried in turn: the first keeps rim triangles well shaped, the others follow the plane more closely where
-/// slivers of the raw mesh make the first rim cross itself.
-const DEPTHS: [f64; 4] = [0.25, 0.1, 0.02, 0.4];
+/// Vertices nearer to a plane than this part of their shortest edge count as outside it by as much, so that no rim edge
+/// has length zero where the mesh has vertices in the plane (grid-aligned phantoms).
+const APART: f64 = 1e-3;
+/// Rim edges shorter than this part of the mesh's mean edge collapse: neighbours on a rim then stay in order when they
+/// move onto f = 0, by at most a sagitta (.1 of an edge on a radius of one edge).
+const RIM_EDGE: f64 = 0.4;
+/// A rim vertex that moves farther than this times the mesh's mean edge has lost its wall.
+const RIM_REACH: f64 = 2.0;
 /// Sine of the angle between plane and wall below which the rim is not well defined: at .1 (6 degrees) an error of
 /// .02 mm of the wall moves the rim by .2 mm.
 const GRAZING: f64 = 0.1;
@@ -86,17 +90,12 @@ pub fn cut(mesh: &TriMesh, field: &dyn Field, cuts: &[CutPlane], ctx: &Ctx) -> R
     for (k, _) in flats.iter().enumerate() {
         ctx.progress(k as f64 / flats.len() as f64);
         ctx.check()?;
-        let mut kept = one(&now, field, &flats, (k, DEPTHS[0]), &mut report);
-        for &depth in &DEPTHS[1..] {
-            if matches!(kept, Err(Error::CrossedRim { .. })) {
-                kept = one(&now, field, &flats, (k, depth), &mut report);
-            }
-        }
-        match kept? {
+        match one(&now, field, &flats, k, ctx)? {
             Some(m) => now = m,
             None => report.missed.push(k),
         }
     }
+    let mut now = landed_rims(&now, field, &flats, &mut report, ctx)?;
     report.caps = number(&mut now, &flats)?;
     ctx.progress(1.0);
     Ok((now, report))
@@ -108,35 +107,20 @@ fn tidy(mesh: &TriMesh, field: &dyn Field, ctx: &Ctx) -> Result<TriMesh, Error> 
     let mut wall = mesh.clone();
     wall.face_id.fill(WALL);
     let mut fabric = Fabric::new(&wall, field, Vec::new())?;
-    for t in 0..wall.triangles.len() {
-        let normal = wall.area_vector(t).raw();
-        wall.triangles[t].iter().for_each(|&v| fabric.gradient[v as usize] -= normal);
-    }
-    let (sum, count) = fabric.edges().fold((0.0, 0_u32), |(s, n), h| (s + fabric.web.length(h), n + 1));
-    fabric.size.fill(sum / f64::from(count.max(1)));
-    for _ in 0..2 {
-        collapse_short(&mut fabric, ctx)?;
-        flip_to_valence(&mut fabric, ctx)?;
-    }
+    thin_out(&mut fabric, 1.0, ctx)?;
     Ok(fabric.web.mesh())
 }
 
 /// Cut by plane k; `None` when nothing lies outside.
-fn one(
-    mesh: &TriMesh,
-    field: &dyn Field,
-    flats: &[Flat],
-    (k, depth): (usize, f64),
-    report: &mut CutReport,
-) -> Result<Option<TriMesh>, Error> {
+fn one(mesh: &TriMesh, field: &dyn Field, flats: &[Flat], k: usize, ctx: &Ctx) -> Result<Option<TriMesh>, Error> {
     let web = Web::weave(mesh)?;
     let plane = flats[k];
     let mut height: Vec<f64> = web.at.iter().map(|&x| plane.height(x)).collect();
     let all_within = height.iter().all(|&h| h < 0.0);
     for (v, height) in height.iter_mut().enumerate() {
         let shortest = web.spokes(v as u32).map(|h| web.length(h)).fold(f64::INFINITY, f64::min);
-        if *height > -depth * shortest {
-            *height = height.max(depth * shortest);
+        if *height > -APART * shortest {
+            *height = height.max(APART * shortest);
         }
     }
     let inside: Vec<bool> = height.iter().map(|&h| h < 0.0).collect();
@@ -152,14 +136,60 @@ fn one(
         .filter(|&h| inside[web.origin[h as usize] as usize] && !inside[web.target(h) as usize]);
     let mut number = BTreeMap::new();
     for h in crossed {
-        let v = clipped.mesh.vertices.len() as u32;
-        clipped.mesh.vertices.push(P3::from_raw(rim_vertex(&web, field, flats, (k, h), &height, report)?));
-        number.insert(h, v);
+        let (a, b) = (web.origin[h as usize] as usize, web.target(h) as usize);
+        let place = web.at[a].lerp(web.at[b], height[a] / (height[a] - height[b]));
+        number.insert(h, clipped.mesh.vertices.len() as u32);
+        clipped.mesh.vertices.push(P3::from_raw(place - plane.normal * plane.height(place)));
     }
     let boundary = clipped.triangles(&web, &inside, &number);
-    let rims: Vec<Rim> = loops(&boundary).into_iter().map(|vertices| Rim { vertices, plane: k }).collect();
-    close(&mut clipped.mesh, &rims, &plane)?;
-    Ok(Some(clipped.mesh))
+    for ring in loops(&boundary) {
+        clipped.fan(&ring, k as u32 + 1);
+    }
+    let mut fabric = Fabric::new(&clipped.mesh, field, flats.to_vec())?;
+    collapse_curves(&mut fabric, RIM_EDGE, ctx)?;
+    recap(&fabric.web, flats).map(Some)
+}
+
+/// Rim vertices on f = 0 within their planes (corners: within both), and the caps triangulated anew.
+fn landed_rims(
+    mesh: &TriMesh,
+    field: &dyn Field,
+    flats: &[Flat],
+    report: &mut CutReport,
+    ctx: &Ctx,
+) -> Result<TriMesh, Error> {
+    let mut fabric = Fabric::new(mesh, field, flats.to_vec())?;
+    let reach = fabric.mean_edge();
+    let rim: Vec<(u32, Tie, usize)> = (fabric.living().into_iter().filter(|&v| fabric.on_crease(v)))
+        .filter_map(|v| {
+            let (tie, plane) = rim_tie(&fabric, flats, v);
+            tie.wall.then_some((v, tie, plane))
+        })
+        .collect();
+    let landings =
+        ctx.map(&rim, |(v, tie, _)| land(field, fabric.web.at[*v as usize], tie, Approach::exact(0.5 * reach)))?;
+    for (&(v, tie, plane), l) in rim.iter().zip(&landings) {
+        let sine = tie.free(l.gradient).length() / l.gradient.length();
+        let moved = l.at.distance(fabric.web.at[v as usize]);
+        if !(sine >= GRAZING && moved <= RIM_REACH * reach) {
+            return Err(Error::GrazingCut { plane, sine, at: P3::from_raw(fabric.web.at[v as usize]) });
+        }
+        landed(v as usize, l)?;
+        fabric.take(v, l);
+    }
+    report.evaluations += fabric.evaluations;
+    recap(&fabric.web, flats)
+}
+
+/// What a rim vertex is tied to, and one of the planes it lies in.
+fn rim_tie(fabric: &Fabric<'_>, flats: &[Flat], v: u32) -> (Tie, usize) {
+    let mut ids: Vec<u32> = fabric.web.spokes(v).map(|h| fabric.web.id(h)).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    let mut planes = ids.iter().filter(|&&id| id != WALL).map(|&id| id as usize - 1);
+    let (first, second) = (planes.next(), planes.next());
+    let flat = |k: Option<usize>| k.and_then(|k| flats.get(k)).copied();
+    (Tie { wall: ids.contains(&WALL), planes: [flat(first), flat(second)] }, first.unwrap_or(0))
 }
 
 /// Rim vertices are numbered after the kept ones.
@@ -214,8 +244,21 @@ impl Clipped {
     }
 }
 
+impl Clipped {
+    /// Close a ring with triangles to a vertex in its middle.
+    fn fan(&mut self, ring: &[u32], id: u32) {
+        let sum = ring.iter().fold(DVec3::ZERO, |s, &v| s + self.mesh.vertices[v as usize].raw());
+        let middle = self.mesh.vertices.len() as u32;
+        self.mesh.vertices.push(P3::from_raw(sum / ring.len() as f64));
+        for (i, &v) in ring.iter().enumerate() {
+            self.mesh.triangles.push([v, ring[(i + 1) % ring.len()], middle]);
+            self.mesh.face_id.push(id);
+        }
+    }
+}
+
 /// The closed loops of a set of directed edges, each from its smallest vertex.
-fn loops(edges: &BTreeMap<u32, u32>) -> Vec<Vec<u32>> {
+pub(crate) fn loops(edges: &BTreeMap<u32, u32>) -> Vec<Vec<u32>> {
     let mut left = edges.clone();
     let mut loops = Vec::new();
     while let Some((first, mut now)) = left.pop_first() {
@@ -230,42 +273,6 @@ fn loops(edges: &BTreeMap<u32, u32>) -> Vec<Vec<u32>> {
         loops.push(ring);
     }
     loops
-}
-
-/// The place of a rim vertex on the half-edge `h` that leaves the inside: in plane k, and on whatever the edge's two
-/// triangles lie on.
-fn rim_vertex(
-    web: &Web,
-    field: &dyn Field,
-    flats: &[Flat],
-    (k, h): (usize, u32),
-    height: &[f64],
-    report: &mut CutReport,
-) -> Result<DVec3, Error> {
-    let (a, b) = (web.origin[h as usize] as usize, web.target(h) as usize);
-    let t = height[a] / (height[a] - height[b]);
-    let start = web.at[a].lerp(web.at[b], t);
-    let ids = [web.id(h), web.id(web.twin[h as usize])];
-    let other = ids.iter().find(|&&id| id != WALL).and_then(|&id| flats.get(id as usize - 1)).copied();
-    let tie = Tie { wall: ids.contains(&WALL), planes: [Some(flats[k]), other] };
-    let grazing = |sine: f64, at: DVec3| Error::GrazingCut { plane: k, sine, at: P3::from_raw(at) };
-    if let Some(o) = other {
-        let sine = o.normal.cross(flats[k].normal).length();
-        if sine < GRAZING {
-            return Err(grazing(sine, start));
-        }
-    }
-    let reach = web.at[a].distance(web.at[b]);
-    let l = land(field, start, &tie, Approach::exact(0.5 * reach));
-    report.evaluations += l.evaluations;
-    if tie.wall {
-        let sine = tie.free(l.gradient).length() / l.gradient.length();
-        if sine < GRAZING || l.at.distance(start) > 3.0 * reach {
-            return Err(grazing(sine, start));
-        }
-        landed(a, &l)?;
-    }
-    Ok(l.at)
 }
 
 /// Number the caps by the places of their centroids and describe them.
@@ -389,7 +396,8 @@ mod tests {
         cuts.reverse();
         let two = cut(&mesh, &field, &cuts, &ctx).unwrap().1;
         for (a, b) in one.caps.iter().zip(&two.caps) {
-            assert!(a.centroid.distance(b.centroid) < 1e-9 && a.face_id == b.face_id);
+            // Which rim vertices stay depends on the order, so the polygons differ within the mesh's own error.
+            assert!(a.centroid.distance(b.centroid) < 5e-3 && a.face_id == b.face_id);
         }
         // The host's section is a circle; its polygon is a little smaller.
         let area = std::f64::consts::PI * 9.0;

@@ -28,8 +28,14 @@ pub struct Displacement {
 
 /// Rounds of Hartmann's iteration; from one pixel away it needs 3 to 6.
 const ROUNDS: usize = 24;
-/// The foot point stands still when a round moves it by less than this, mm.
+/// The foot point stands still when it is off the normal by less than this, mm ...
 const STILL_MM: f64 = 1e-7;
+/// ... plus this part of the distance: the distance is then wrong by 5e-7 of itself.
+const STILL: f64 = 1e-3;
+/// A landing is over after the Newton step from a point this near: the step leaves about its square, mm.
+const ENOUGH_MM: f64 = 1e-4;
+/// |f| / |grad f| at which no step is needed, mm.
+const LANDED_MM: f64 = 1e-9;
 
 /// The signed distance of every vertex of `mesh` to the zero set of `reference`, positive where the vertex lies outside
 /// (f < 0 there), in mm and in pixels of `pixel_mm`.
@@ -90,26 +96,26 @@ struct Foot {
 }
 
 fn foot(field: &dyn Field, x: DVec3, step_mm: f64) -> Foot {
-    let (f, g) = field.gradient(P3::from_raw(x));
-    let sign = if f > 0.0 { -1.0 } else { 1.0 };
-    let first_order = -f / g.length();
-    let approach = Approach { tolerance_mm: 1e-8, ..Approach::exact(step_mm) };
-    let (mut at, mut evaluations) = (x, 1);
+    let approach = Approach { tolerance_mm: LANDED_MM, enough_mm: ENOUGH_MM, ..Approach::exact(step_mm) };
+    let (mut at, mut evaluations) = (x, 0);
     for _ in 0..ROUNDS {
         let l = land(field, at, &Tie::WALL, approach);
         evaluations += l.evaluations;
-        if !l.at.is_finite() || l.distance > approach.tolerance_mm {
+        if !l.at.is_finite() || !(l.distance <= approach.enough_mm) {
             break;
         }
-        let n = l.gradient.normalize_or_zero();
+        // -grad f / |grad f| looks outward
+        let n = -l.gradient.normalize_or_zero();
         let way = x - l.at;
-        let across = way - n * n.dot(way);
-        if across.length() <= STILL_MM {
-            return Foot { mm: sign * way.length(), found: true, evaluations };
+        let along = n.dot(way);
+        let across = way - n * along;
+        if across.length() <= STILL_MM + STILL * along.abs() {
+            return Foot { mm: along, found: true, evaluations };
         }
         at = l.at + across.clamp_length_max(step_mm);
     }
-    Foot { mm: first_order, found: false, evaluations }
+    let (f, g) = field.gradient(P3::from_raw(x));
+    Foot { mm: -f / g.length(), found: false, evaluations: evaluations + 1 }
 }
 
 #[cfg(test)]

@@ -96,16 +96,23 @@ pub enum Error {
     },
     /// One rim lies inside another.
     #[error(
-        "cut plane {plane} meets a lumen with a hole (one rim lies inside another): cut where the section is simple"
+        "cut plane {plane} meets a lumen with a hole: a rim around {area_mm2:.3} mm2 lies inside another. Either the \
+         segmentation left an island in the lumen (lower the threshold or give a seed) or the plane runs along a loop; \
+         cut where the section is simple"
     )]
     NestedRims {
         /// Plane number in the order given.
         plane: usize,
+        /// Area within the inner rim, mm2.
+        area_mm2: f64,
         /// Where.
         at: P3,
     },
     /// A rim crosses itself or another rim.
-    #[error("the rim at cut plane {plane} crosses itself: use smaller cells or move the cut")]
+    #[error(
+        "the rim at cut plane {plane} crosses itself: the wall is rougher there than the mesh resolves; \
+         use smaller cells, smooth more or move the cut"
+    )]
     CrossedRim {
         /// Plane number in the order given.
         plane: usize,

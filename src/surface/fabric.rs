@@ -34,18 +34,25 @@ pub(crate) struct Fabric<'a> {
     pub(crate) field: &'a dyn Field,
     /// Plane of face id k + 1.
     pub(crate) planes: Vec<Flat>,
-    /// Gradient of f at (or very near) each wall vertex.
-    pub(crate) gradient: Vec<DVec3>,
+    /// Outward unit normal of the wall at (or very near) each wall vertex.
+    pub(crate) normal: Vec<DVec3>,
     /// Wanted edge length at each vertex, mm.
     pub(crate) size: Vec<f64>,
-    /// Calls of (f, grad f) and of the second derivatives.
+    /// Edges at each vertex across which the face id changes: 0 within a face, 2 on a curve, else a corner. Split, flip
+    /// and collapse as they are allowed here never change it for a vertex that stays.
+    pub(crate) marks: Vec<u8>,
+    /// Calls of (f, grad f), and of (f, grad f, second derivatives).
     pub(crate) evaluations: usize,
     pub(crate) hessians: usize,
 }
 
-/// Smallest angle of a triangle, radians.
-pub(crate) fn min_angle(p: [DVec3; 3]) -> f64 {
-    angles(p).into_iter().fold(f64::INFINITY, f64::min)
+/// The cotangents of a triangle's angles, and its unit normal: all that shape and facing need, without a trigonometric
+/// function.
+pub(crate) fn cotangents(p: [DVec3; 3]) -> ([f64; 3], DVec3) {
+    let (a, b, c) = (p[1] - p[0], p[2] - p[1], p[0] - p[2]);
+    let doubled = a.cross(-c);
+    let inverse = 1.0 / doubled.length().max(f64::MIN_POSITIVE);
+    ([-a.dot(c) * inverse, -a.dot(b) * inverse, -b.dot(c) * inverse], doubled * inverse)
 }
 
 /// The three angles of a triangle, radians.
@@ -54,25 +61,32 @@ pub(crate) fn angles(p: [DVec3; 3]) -> [f64; 3] {
     [0, 1, 2].map(|k| doubled.atan2((p[(k + 1) % 3] - p[k]).dot(p[(k + 2) % 3] - p[k])))
 }
 
-/// Worst of some triangles: smallest angle (radians) and smallest cosine to the surface's normal.
+/// Worst of some triangles: largest cotangent (the smallest angle's) and smallest cosine to the surface's normal.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Worth {
-    pub(crate) angle: f64,
+    pub(crate) cot: f64,
     pub(crate) facing: f64,
 }
 
 impl Worth {
-    pub(crate) const BEST: Self = Self { angle: f64::INFINITY, facing: f64::INFINITY };
+    pub(crate) const BEST: Self = Self { cot: f64::NEG_INFINITY, facing: f64::INFINITY };
     pub(crate) fn with(self, o: Self) -> Self {
-        Self { angle: self.angle.min(o.angle), facing: self.facing.min(o.facing) }
+        Self { cot: self.cot.max(o.cot), facing: self.facing.min(o.facing) }
     }
-    /// Whether `self` may follow `before`: not folded (or less than before) and not thinner than both `floor` and before.
+    /// The smallest angle, degrees.
+    pub(crate) fn angle_deg(self) -> f64 {
+        1_f64.atan2(self.cot).to_degrees()
+    }
+    /// Whether `self` may follow `before`: not folded (or less than before) and not thinner than both the angle whose
+    /// cotangent is `floor` and before.
     pub(crate) fn may_follow(self, before: Self, floor: f64) -> bool {
-        self.facing >= FACING.min(before.facing) && self.angle >= floor.min(before.angle)
+        self.facing >= FACING.min(before.facing) && self.cot <= floor.max(before.cot)
     }
     /// Whether `self` is better than `before` by a noticeable angle.
     pub(crate) fn improves(self, before: Self) -> bool {
-        self.facing >= FACING.min(before.facing) && self.angle > before.angle + NOTICEABLE
+        // d cot = -(1 + cot^2) d angle
+        let noticeable = NOTICEABLE * (1.0 + before.cot * before.cot);
+        self.facing >= FACING.min(before.facing) && self.cot < before.cot - noticeable
     }
 }
 
@@ -83,7 +97,59 @@ impl<'a> Fabric<'a> {
     pub(crate) fn new(mesh: &TriMesh, field: &'a dyn Field, planes: Vec<Flat>) -> Result<Self, Error> {
         let web = Web::weave(mesh)?;
         let n = web.at.len();
-        Ok(Self { web, field, planes, gradient: vec![DVec3::ZERO; n], size: vec![0.0; n], evaluations: 0, hessians: 0 })
+        let mut marks = vec![0_u8; n];
+        for h in (0..web.origin.len() as u32).filter(|&h| web.is_feature(h)) {
+            let mark = &mut marks[web.origin[h as usize] as usize];
+            *mark = mark.saturating_add(1);
+        }
+        let mut fabric = Self {
+            web,
+            field,
+            planes,
+            normal: vec![DVec3::ZERO; n],
+            size: vec![0.0; n],
+            marks,
+            evaluations: 0,
+            hessians: 0,
+        };
+        fabric.mesh_normals();
+        Ok(fabric)
+    }
+
+    /// Normals of the wall from its triangles, where f has not been asked yet.
+    fn mesh_normals(&mut self) {
+        for t in (0..self.web.face_id.len()).filter(|&t| self.web.face_id[t] == WALL) {
+            let c = self.web.corners(t);
+            let p = self.places(c);
+            let doubled = (p[1] - p[0]).cross(p[2] - p[0]);
+            c.iter().for_each(|&v| self.normal[v as usize] += doubled);
+        }
+        self.normal.iter_mut().for_each(|n| *n = n.normalize_or_zero());
+    }
+
+    /// Split an edge in its middle; gives the new vertex. Inside the wall it is raised by the sagitta of the chord, from
+    /// the normals at both ends: (b - a).(n_b - n_a) / 8.
+    pub(crate) fn split(&mut self, h: u32) -> u32 {
+        let (a, b) = (self.web.origin[h as usize] as usize, self.web.target(h) as usize);
+        let crease = self.web.is_feature(h);
+        let (p, q, n, m) = (self.web.at[a], self.web.at[b], self.normal[a], self.normal[b]);
+        let normal = (n + m).normalize_or_zero();
+        let raised = !crease && self.web.id(h) == WALL;
+        let sagitta = if raised { (q - p).dot(m - n) / 8.0 } else { 0.0 };
+        self.size.push(0.5 * (self.size[a] + self.size[b]));
+        self.normal.push(normal);
+        self.marks.push(if crease { 2 } else { 0 });
+        self.web.split(h, 0.5 * (p + q) + normal * sagitta)
+    }
+
+    /// Drop what belongs to vertices that are gone, so that numbers stay dense.
+    pub(crate) fn compact(&mut self) -> Result<(), Error> {
+        let keep: Vec<usize> = (0..self.web.at.len()).filter(|&v| self.web.leaving[v] != NONE).collect();
+        self.normal = keep.iter().map(|&v| self.normal[v]).collect();
+        self.size = keep.iter().map(|&v| self.size[v]).collect();
+        self.marks = keep.iter().map(|&v| self.marks[v]).collect();
+        self.web = Web::weave(&self.web.mesh())?;
+        Ok(())
     }
 
     fn plane(&self, id: u32) -> Option<Flat> {
@@ -92,6 +158,9 @@ impl<'a> Fabric<'a> {
 
     /// How a vertex may move.
     pub(crate) fn seat(&self, v: u32) -> Seat {
+        if self.marks[v as usize] == 0 {
+            return Seat::Face(self.tie([self.web.id(self.web.leaving[v as usize]); 2]));
+        }
         let (mut marks, mut ids, mut count) = ([NONE; 2], [WALL; 2], 0);
         for h in self.web.spokes(v) {
             if self.web.is_feature(h) {
@@ -103,7 +172,6 @@ impl<'a> Fabric<'a> {
             }
         }
         match count {
-            0 => Seat::Face(self.tie([self.web.id(self.web.leaving[v as usize]); 2])),
             2 => Seat::Crease(self.tie(ids), marks),
             _ => Seat::Fixed,
         }
@@ -116,7 +184,7 @@ impl<'a> Fabric<'a> {
 
     /// Whether a vertex lies on a curve or corner.
     pub(crate) fn on_crease(&self, v: u32) -> bool {
-        self.web.spokes(v).any(|h| self.web.is_feature(h))
+        self.marks[v as usize] != 0
     }
 
     /// Living vertices.
@@ -129,6 +197,12 @@ impl<'a> Fabric<'a> {
         (0..self.web.origin.len() as u32).filter(|&h| self.web.lives(h) && h < self.web.twin[h as usize])
     }
 
+    /// Mean length of the living edges, mm.
+    pub(crate) fn mean_edge(&self) -> f64 {
+        let (sum, count) = self.edges().fold((0.0, 0_u32), |(s, n), h| (s + self.web.length(h), n + 1));
+        sum / f64::from(count.max(1))
+    }
+
     /// Wanted length of an edge.
     pub(crate) fn wanted(&self, h: u32) -> f64 {
         let (a, b) = (self.web.origin[h as usize] as usize, self.web.target(h) as usize);
@@ -137,15 +211,14 @@ impl<'a> Fabric<'a> {
 
     /// Worth of one triangle with given corners (vertex numbers for the normals, positions).
     pub(crate) fn worth(&self, id: u32, corners: [u32; 3], p: [DVec3; 3]) -> Worth {
-        let normal = (p[1] - p[0]).cross(p[2] - p[0]).normalize_or_zero();
-        let outward = match self.plane(id) {
-            Some(plane) => plane.normal,
-            None => {
-                let g = corners.map(|v| self.gradient[v as usize].normalize_or_zero());
-                -(g[0] + g[1] + g[2]).normalize_or_zero()
-            }
+        let (cot, normal) = cotangents(p);
+        let outward = if id == WALL {
+            let [a, b, c] = corners.map(|v| self.normal[v as usize]);
+            (a + b + c).normalize_or_zero()
+        } else {
+            self.plane(id).map_or(normal, |p| p.normal)
         };
-        Worth { angle: min_angle(p), facing: normal.dot(outward) }
+        Worth { cot: cot[0].max(cot[1]).max(cot[2]), facing: normal.dot(outward) }
     }
 
     pub(crate) fn places(&self, corners: [u32; 3]) -> [DVec3; 3] {
@@ -194,10 +267,10 @@ impl<'a> Fabric<'a> {
     /// link condition, a chord from rim to rim, or an edge longer than `longest` times its wanted length.
     pub(crate) fn collapse_worth(&self, h: u32, longest: f64) -> Option<(Worth, Worth)> {
         let (a, b) = (self.web.origin[h as usize], self.web.target(h));
-        let slides = match self.seat(a) {
-            Seat::Face(_) => true,
-            Seat::Crease(..) => self.web.is_feature(h),
-            Seat::Fixed => false,
+        let slides = match self.marks[a as usize] {
+            0 => true,
+            2 => self.web.is_feature(h),
+            _ => false,
         };
         if !slides || self.web.collapse_blocked(h) {
             return None;
@@ -233,12 +306,14 @@ impl<'a> Fabric<'a> {
         self.web.at[v as usize] = l.at;
         self.evaluations += l.evaluations;
         if l.evaluations > 0 {
-            self.gradient[v as usize] = l.gradient;
+            self.normal[v as usize] = -l.gradient.normalize_or_zero();
         }
     }
 
     /// Land some vertices on what they are tied to, in parallel; fixed ones stay.
-    pub(crate) fn settle(&mut self, vertices: &[u32], approach: Approach, ctx: &Ctx) -> Result<(), Error> {
+    ///
+    /// Gives each vertex's distance |f| / |grad f| at its last evaluation, mm (0 within caps).
+    pub(crate) fn settle(&mut self, vertices: &[u32], approach: Approach, ctx: &Ctx) -> Result<Vec<f64>, Error> {
         let landings = ctx.map(vertices, |&v| {
             let x = self.web.at[v as usize];
             match self.seat(v) {
@@ -247,7 +322,9 @@ impl<'a> Fabric<'a> {
                     // A corner keeps its place; its gradient is still wanted as a normal.
                     let (f, g) = self.field.gradient(P3::from_raw(x));
                     let gradient = g.raw();
-                    Landing { at: x, gradient, distance: f.abs() / gradient.length(), evaluations: 1 }
+                    let wall = self.web.spokes(v).any(|h| self.web.id(h) == WALL);
+                    let distance = if wall { f.abs() / gradient.length() } else { 0.0 };
+                    Landing { at: x, gradient, distance, evaluations: 1 }
                 }
             }
         })?;
@@ -257,7 +334,7 @@ impl<'a> Fabric<'a> {
             }
             self.take(v, l);
         }
-        Ok(())
+        Ok(landings.iter().map(|l| l.distance).collect())
     }
 
     /// Living triangles.

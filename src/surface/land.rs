@@ -93,6 +93,8 @@ pub(crate) struct Approach {
     pub(crate) step_mm: f64,
     /// Stop at this |f| / |grad f|, mm.
     pub(crate) tolerance_mm: f64,
+    /// Stop after the Newton step from a point this near, mm.
+    pub(crate) enough_mm: f64,
     /// Most evaluations; the last one is followed by its Newton step.
     pub(crate) evaluations: usize,
 }
@@ -100,11 +102,11 @@ pub(crate) struct Approach {
 impl Approach {
     /// All the way, to [`LANDED_MM`].
     pub(crate) fn exact(step_mm: f64) -> Self {
-        Self { step_mm, tolerance_mm: LANDED_MM, evaluations: MOST_STEPS }
+        Self { step_mm, tolerance_mm: LANDED_MM, enough_mm: 0.0, evaluations: MOST_STEPS }
     }
     /// One evaluation and its Newton step: enough to follow the wall while a mesh is being improved.
     pub(crate) fn follow(step_mm: f64) -> Self {
-        Self { step_mm, tolerance_mm: LANDED_MM, evaluations: 1 }
+        Self { step_mm, tolerance_mm: LANDED_MM, enough_mm: 0.0, evaluations: 1 }
     }
 }
 
@@ -131,6 +133,9 @@ pub(crate) fn land(field: &dyn Field, x: DVec3, tie: &Tie, approach: Approach) -
             Some((a, b)) => 0.5 * (a + b),
             None => now.at - free * ((f / slope).clamp(-approach.step_mm, approach.step_mm) / slope),
         });
+        if now.distance <= approach.enough_mm {
+            break;
+        }
         before = now.distance;
     }
     now

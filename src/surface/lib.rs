@@ -17,6 +17,8 @@ mod intersect;
 mod land;
 mod mesh;
 mod patch;
+#[cfg(test)]
+mod phantoms;
 mod polish;
 mod polygonise;
 mod quality;

@@ -5,27 +5,28 @@
 //! that it touches grows, so the passes cannot undo each other.
 
 use crate::Error;
-use crate::fabric::{Fabric, Seat, Worth, angles};
+use crate::fabric::{Fabric, Seat, Worth, cotangents};
 use crate::improve::tangential;
 use crate::land::{Approach, Landing, Tie, land};
 use crate::web::GONE;
 use exec::Ctx;
 use glam::DVec3;
 
-/// Angles above this are bad as well, radians (105 degrees).
-const WIDE: f64 = 1.83;
+/// Angles with a cotangent below this are bad as well (105 degrees).
+const WIDE: f64 = -0.268;
 /// A collapse here may leave edges up to this times their wanted length.
 const STRETCH: f64 = 1.6;
 
-/// Work on triangles below `goal` (radians) until none is left or nothing helps; gives the number of changes.
-pub(crate) fn polish(fabric: &mut Fabric<'_>, goal: f64, rounds: usize, ctx: &Ctx) -> Result<usize, Error> {
+/// Work on triangles with an angle below `goal_deg` until none is left or nothing helps; gives the number of changes.
+pub(crate) fn polish(fabric: &mut Fabric<'_>, goal_deg: f64, rounds: usize, ctx: &Ctx) -> Result<usize, Error> {
+    let goal = goal_deg.to_radians().tan().recip();
     let mut total = 0;
     for _ in 0..rounds {
         let mut bad: Vec<(f64, usize)> = (0..fabric.web.face_id.len())
             .filter(|&t| fabric.web.face_id[t] != GONE)
             .filter_map(|t| Some((badness(fabric, t, goal)?, t)))
             .collect();
-        bad.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+        bad.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
         let mut changes = 0;
         for (i, &(_, t)) in bad.iter().enumerate() {
             if i % 64 == 0 {
@@ -43,11 +44,11 @@ pub(crate) fn polish(fabric: &mut Fabric<'_>, goal: f64, rounds: usize, ctx: &Ct
     Ok(total)
 }
 
-/// The smallest angle of a triangle that is too thin or too wide.
+/// The largest cotangent of a triangle that is too thin or too wide.
 fn badness(fabric: &Fabric<'_>, t: usize, goal: f64) -> Option<f64> {
-    let a = angles(fabric.places(fabric.web.corners(t)));
-    let (least, most) = (a[0].min(a[1]).min(a[2]), a[0].max(a[1]).max(a[2]));
-    (least < goal || most > WIDE).then_some(least)
+    let c = cotangents(fabric.places(fabric.web.corners(t))).0;
+    let (least, most) = (c[0].min(c[1]).min(c[2]), c[0].max(c[1]).max(c[2]));
+    (most > goal || least < WIDE).then_some(most)
 }
 
 /// Try flips, then places, then collapses at one triangle.
@@ -96,7 +97,7 @@ fn better_place(fabric: &mut Fabric<'_>, v: u32) -> bool {
     for _ in 0..7 {
         let tries = ways.iter().map(|&w| (fabric.star_moved(v, place + w * step), place + w * step));
         let top = tries.fold((Worth::BEST, None::<DVec3>), |top, (w, p)| match top.1 {
-            Some(_) if top.0.angle >= w.angle => top,
+            Some(_) if top.0.cot <= w.cot => top,
             _ => (w, Some(p)),
         });
         match top {
@@ -112,10 +113,8 @@ fn better_place(fabric: &mut Fabric<'_>, v: u32) -> bool {
     if !l.at.is_finite() || !fabric.star_moved(v, l.at).improves(before) {
         return false;
     }
-    fabric.take(v, &Landing { evaluations: 0, ..l });
-    if l.evaluations > 0 {
-        fabric.gradient[v as usize] = l.gradient;
-    }
+    fabric.evaluations -= l.evaluations; // `take` counts them
+    fabric.take(v, &l);
     true
 }
 
@@ -126,7 +125,7 @@ fn around(fabric: &Fabric<'_>, v: u32, tie: &Tie, along: Option<DVec3>) -> Vec<D
         return vec![d, -d];
     }
     let n = if tie.wall {
-        fabric.gradient[v as usize]
+        fabric.normal[v as usize]
     } else {
         tie.planes[0].or(tie.planes[1]).map_or(DVec3::Z, |p| p.normal)
     };

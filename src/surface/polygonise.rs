@@ -186,7 +186,8 @@ fn first_cells(
     report.cells_visited += cells.len();
     report.evaluations += lattice.learn(&cells, ctx)?;
     let stray: Vec<P3> = own.iter().filter(|&&(c, _)| !lattice.is_crossed(c)).map(|&(_, p)| p).collect();
-    let approach = Approach { step_mm: lattice.cell_mm, tolerance_mm: 0.1 * lattice.cell_mm, evaluations: 6 };
+    let approach =
+        Approach { step_mm: lattice.cell_mm, tolerance_mm: 0.1 * lattice.cell_mm, enough_mm: 0.0, evaluations: 6 };
     let feet = ctx.map(&stray, |p| land(lattice.field, p.raw(), &Tie::WALL, approach))?;
     report.evaluations += feet.iter().map(|l| l.evaluations).sum::<usize>();
     let reach = 2.0 * lattice.cell_mm;

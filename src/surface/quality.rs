@@ -1,7 +1,6 @@
 //! How good the mesh is: shapes of triangles, and their distance from f = 0.
 
-use crate::fabric::{Fabric, Seat, angles};
-use crate::land::{Landing, landed};
+use crate::fabric::angles;
 use crate::{Error, TriMesh, WALL};
 use exec::Ctx;
 use implicit::Field;
@@ -99,22 +98,4 @@ fn distances(mesh: &TriMesh, field: &dyn Field, q: &mut Quality, ctx: &Ctx) -> R
     }
     q.face_rms_mm = if area > 0.0 { (square / area).sqrt() } else { 0.0 };
     Ok(())
-}
-
-/// Every vertex that is tied to the wall has landed on it.
-pub(crate) fn wall_landed(fabric: &Fabric<'_>, vertices: &[u32], ctx: &Ctx) -> Result<(), Error> {
-    let results = ctx.map(vertices, |&v| {
-        let wall = match fabric.seat(v) {
-            Seat::Face(tie) | Seat::Crease(tie, _) => tie.wall,
-            Seat::Fixed => fabric.web.spokes(v).any(|h| fabric.web.id(h) == WALL),
-        };
-        if !wall {
-            return Ok(());
-        }
-        let at = fabric.web.at[v as usize];
-        let (f, g) = fabric.field.gradient(P3::from_raw(at));
-        let gradient = g.raw();
-        landed(v as usize, &Landing { at, gradient, distance: f.abs() / gradient.length(), evaluations: 1 })
-    })?;
-    results.into_iter().collect()
 }

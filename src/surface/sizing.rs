@@ -6,9 +6,11 @@
 //! [`GRADING`] per unit of way.
 
 use crate::fabric::{Fabric, Seat};
+use crate::land::{Approach, Flat, Landing, Tie, land};
 use crate::{Error, Sizing};
 use exec::Ctx;
 use glam::{DMat3, DVec3};
+use implicit::Field;
 use space::P3;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -45,32 +47,74 @@ fn edge_for(curvature: f64, error: f64, [least, most]: [f64; 2]) -> f64 {
     (SAFETY * square.max(0.0).sqrt()).clamp(least, most)
 }
 
-/// Wanted sizes at some vertices by the sizing rule, before grading. Caps take the longest; grading brings them down.
-pub(crate) fn measure(fabric: &mut Fabric<'_>, vertices: &[u32], rule: &Rule, ctx: &Ctx) -> Result<(), Error> {
-    let sizes: Vec<(f64, usize)> = match rule.sizing {
-        Sizing::Uniform(h) => vec![(h, 0); vertices.len()],
-        Sizing::Curvature => ctx.map(vertices, |&v| {
-            let (wall, plane) = match fabric.seat(v) {
-                Seat::Face(tie) => (tie.wall, None),
-                Seat::Crease(tie, _) => (tie.wall, tie.planes[0].or(tie.planes[1])),
-                Seat::Fixed => (true, None),
-            };
-            if !wall {
-                return (rule.edge_mm[1], 0);
+/// Land some vertices to first order and measure the wanted sizes there by the sizing rule, before grading: one
+/// evaluation each, with second derivatives when the rule asks for curvature. Caps take the longest edge; grading brings
+/// it down.
+pub(crate) fn meet(fabric: &mut Fabric<'_>, vertices: &[u32], rule: &Rule, ctx: &Ctx) -> Result<(), Error> {
+    if let Sizing::Uniform(h) = rule.sizing {
+        let approach = Approach { enough_mm: NEAR * h, evaluations: 4, ..Approach::exact(h) };
+        fabric.settle(vertices, approach, ctx)?;
+        vertices.iter().for_each(|&v| fabric.size[v as usize] = h);
+        return Ok(());
+    }
+    let met: Vec<Met> = ctx.map(vertices, |&v| {
+        let x = fabric.web.at[v as usize];
+        match fabric.seat(v) {
+            Seat::Face(tie) => by_curvature(fabric.field, x, &tie, None, rule),
+            Seat::Crease(tie, _) => by_curvature(fabric.field, x, &tie, tie.planes[0].or(tie.planes[1]), rule),
+            Seat::Fixed => {
+                let m = by_curvature(fabric.field, x, &Tie::WALL, None, rule);
+                Met { landing: Landing { at: x, ..m.landing }, ..m }
             }
-            let (_, g, hessian) = fabric.field.hessian(P3::from_raw(fabric.web.at[v as usize]));
-            let along = plane.map_or(0.0, |p| curve_curvature(g.raw(), hessian, p.normal));
-            (edge_for(largest_curvature(g.raw(), hessian).max(along), rule.max_error_mm, rule.edge_mm), 1)
-        })?,
-    };
-    for (&v, (h, evaluations)) in vertices.iter().zip(sizes) {
-        if !h.is_finite() {
+        }
+    })?;
+    for (&v, m) in vertices.iter().zip(&met) {
+        if !(m.size.is_finite() && m.landing.at.is_finite()) {
             return Err(Error::NotFinite { at: P3::from_raw(fabric.web.at[v as usize]) });
         }
-        fabric.size[v as usize] = h;
-        fabric.hessians += evaluations;
+        fabric.take(v, &m.landing);
+        fabric.size[v as usize] = m.size;
+        if m.measured {
+            fabric.normal[v as usize] = m.normal;
+            fabric.hessians += 1;
+        }
     }
     Ok(())
+}
+
+/// A first-order landing is followed by another one when it began farther off than this fraction of the wanted edge.
+const NEAR: f64 = 0.1;
+
+/// A landed and measured vertex.
+struct Met {
+    landing: Landing,
+    normal: DVec3,
+    size: f64,
+    /// Whether the second derivatives were asked for.
+    measured: bool,
+}
+
+fn by_curvature(field: &dyn Field, x: DVec3, tie: &Tie, plane: Option<Flat>, rule: &Rule) -> Met {
+    if !tie.wall {
+        let landing = Landing { at: tie.settle(x), ..Landing::default() };
+        return Met { landing, normal: DVec3::ZERO, size: rule.edge_mm[1], measured: false };
+    }
+    let x = tie.settle(x);
+    let (f, g, hessian) = field.hessian(P3::from_raw(x));
+    let g = g.raw();
+    let along = plane.map_or(0.0, |p| curve_curvature(g, hessian, p.normal));
+    let size = edge_for(largest_curvature(g, hessian).max(along), rule.max_error_mm, rule.edge_mm);
+    let free = tie.free(g);
+    let slope = free.length();
+    let step = free * (-(f / slope).clamp(-rule.edge_mm[1], rule.edge_mm[1]) / slope);
+    let at = tie.settle(x + step);
+    let normal = -(g + hessian * step).normalize_or_zero();
+    if f.abs() / slope <= NEAR * size {
+        return Met { landing: Landing { at, ..Landing::default() }, normal, size, measured: true };
+    }
+    let approach = Approach { enough_mm: NEAR * size, evaluations: 4, ..Approach::exact(rule.edge_mm[1]) };
+    let landing = land(field, at, tie, approach);
+    Met { landing, normal: -landing.gradient.normalize_or_zero(), size, measured: true }
 }
 
 /// What sizes follow.
@@ -83,9 +127,19 @@ pub(crate) struct Rule {
 
 /// Limit the growth of sizes along edges: the largest function below the present sizes with slope [`GRADING`].
 pub(crate) fn grade(fabric: &mut Fabric<'_>) {
+    let lowers = |h: u32, fabric: &Fabric<'_>| {
+        let v = fabric.web.origin[h as usize] as usize;
+        fabric.size[v] + GRADING * fabric.web.length(h) < fabric.size[fabric.web.target(h) as usize]
+    };
+    let mut first: Vec<u32> = (0..fabric.web.origin.len() as u32)
+        .filter(|&h| fabric.web.lives(h) && lowers(h, fabric))
+        .map(|h| fabric.web.origin[h as usize])
+        .collect();
+    first.sort_unstable();
+    first.dedup();
     // Positive floats order as their bits do.
     let mut open: BinaryHeap<Reverse<(u64, u32)>> =
-        fabric.living().into_iter().map(|v| Reverse((fabric.size[v as usize].to_bits(), v))).collect();
+        first.into_iter().map(|v| Reverse((fabric.size[v as usize].to_bits(), v))).collect();
     while let Some(Reverse((bits, v))) = open.pop() {
         if bits != fabric.size[v as usize].to_bits() {
             continue;

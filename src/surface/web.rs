@@ -30,6 +30,8 @@ pub(crate) struct Web {
     pub(crate) face_id: Vec<u32>,
     /// One half-edge leaving each vertex, or NONE.
     pub(crate) leaving: Vec<u32>,
+    /// Number of edges at each vertex.
+    pub(crate) degree: Vec<u32>,
     pub(crate) at: Vec<DVec3>,
 }
 
@@ -46,20 +48,18 @@ impl Web {
         for (h, &v) in origin.iter().enumerate().rev() {
             leaving[v as usize] = h as u32;
         }
-        let web = Self { origin, twin, face_id: mesh.face_id.clone(), leaving, at };
+        let mut degree = vec![0; at.len()];
+        origin.iter().for_each(|&v| degree[v as usize] += 1);
+        let web = Self { origin, twin, face_id: mesh.face_id.clone(), leaving, degree, at };
         web.single_fans()?;
         Ok(web)
     }
 
     /// Every vertex must have one fan of triangles.
     fn single_fans(&self) -> Result<(), Defect> {
-        let mut count = vec![0_u32; self.at.len()];
-        for &v in &self.origin {
-            count[v as usize] += 1;
-        }
         for v in 0..self.at.len() as u32 {
             let h = self.leaving[v as usize];
-            if h == NONE || self.spokes(v).count() != count[v as usize] as usize {
+            if h == NONE || self.spokes(v).count() != self.valence(v) {
                 let kind = if h == NONE { DefectKind::LooseVertex } else { DefectKind::NonManifoldVertex };
                 return Err(Defect { kind, element: v as usize, at: P3::from_raw(self.at[v as usize]) });
             }
@@ -118,7 +118,7 @@ impl Web {
     }
     /// Number of edges at a vertex.
     pub(crate) fn valence(&self, v: u32) -> usize {
-        self.spokes(v).count()
+        self.degree[v as usize] as usize
     }
     /// The half-edge from a to b, if the edge exists.
     pub(crate) fn between(&self, a: u32, b: u32) -> Option<u32> {
@@ -160,6 +160,9 @@ impl Web {
         self.join(n + 5, outer_db);
         self.leaving.push(n);
         self.leaving[b as usize] = n + 1;
+        self.degree.push(4);
+        self.degree[c as usize] += 1;
+        self.degree[d as usize] += 1;
         m
     }
 
@@ -181,6 +184,10 @@ impl Web {
         for (v, e) in [(a, hp), (b, tp), (c, hn), (d, tn)] {
             self.leaving[v as usize] = e;
         }
+        self.degree[a as usize] -= 1;
+        self.degree[b as usize] -= 1;
+        self.degree[c as usize] += 1;
+        self.degree[d as usize] += 1;
     }
 
     /// Whether the edge's opposite corners are joined already (then it must not be flipped).
@@ -205,6 +212,10 @@ impl Web {
         let (hn, hp, tn, tp) = (next(h), prev(h), next(t), prev(t));
         let (a, b) = (self.origin[h as usize], self.target(h));
         let (c, d) = (self.origin[hp as usize], self.origin[tp as usize]);
+        self.degree[b as usize] = self.degree[a as usize] + self.degree[b as usize] - 4;
+        self.degree[c as usize] -= 1;
+        self.degree[d as usize] -= 1;
+        self.degree[a as usize] = 0;
         let spokes: Vec<u32> = self.spokes(a).collect();
         for e in spokes {
             self.origin[e as usize] = b;

@@ -1,0 +1,118 @@
+//! The surface over many random phantoms and lattice shifts: shapes, evaluations and times.
+//!
+//! `cargo run --release -p surface --example survey -- [COUNT] [FIRST]`; one line per mesh, the worst of all at the end.
+//! Ends with a fault when a bar of the surface is missed.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+#[allow(dead_code)]
+#[path = "../fields.rs"]
+mod fields;
+#[allow(dead_code)]
+#[path = "../phantoms.rs"]
+mod phantoms;
+
+use exec::Ctx;
+use phantoms::{Dice, Phantom, phantom};
+use std::time::Instant;
+use surface::*;
+
+struct Line {
+    name: String,
+    quality: Quality,
+    report: RemeshReport,
+    cells_per: f64,
+    sound: bool,
+    least: f64,
+    ms: [f64; 3],
+}
+
+fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f64, ctx: &Ctx) -> (Line, TriMesh) {
+    let s = PolygoniseSettings { shift, ..PolygoniseSettings::default() };
+    let mut ms = [0.0; 3];
+    let t = Instant::now();
+    let (raw, polygonised) = polygonise(&p.field, &[p.seed], &s, ctx).unwrap();
+    ms[0] = t.elapsed().as_secs_f64() * 1e3;
+    let t = Instant::now();
+    let closed = if p.cuts.is_empty() { raw } else { cut(&raw, &p.field, &p.cuts, ctx).unwrap().0 };
+    ms[1] = t.elapsed().as_secs_f64() * 1e3;
+    let t = Instant::now();
+    let s = RemeshSettings { sizing, max_error_mm, ..RemeshSettings::default() };
+    let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx).unwrap();
+    ms[2] = t.elapsed().as_secs_f64() * 1e3;
+    let topology = check(&mesh).unwrap();
+    let sound =
+        topology.euler == p.euler && topology.components == 1 && self_intersections(&mesh, ctx).unwrap().is_empty();
+    let least = if matches!(sizing, Sizing::Curvature) { 30.0 } else { 33.0 };
+    let cells_per = polygonised.cells_visited as f64 / polygonised.cells as f64;
+    let quality = quality(&mesh, &p.field, ctx).unwrap();
+    (Line { name: name.into(), quality, report, cells_per, sound, least, ms }, mesh)
+}
+
+impl Line {
+    fn calls(&self) -> f64 {
+        (self.report.evaluations + self.report.hessians) as f64 / self.report.vertices as f64
+    }
+    fn holds(&self) -> bool {
+        let q = &self.quality;
+        self.sound
+            && q.min_angle_deg >= self.least
+            && q.max_angle_deg <= 120.0
+            && q.vertex_max_mm <= 1e-9
+            && self.calls() <= 6.0
+    }
+    fn show(&self) {
+        let (q, r) = (&self.quality, &self.report);
+        println!(
+            "{:<16} {} V {:>6}  angles {:>5.1} {:>6.1}  face max {:.4} rms {:.5} vertex {:.0e}  calls {:.2} ({:.2} hessians) cells {:.3}  ms {:.0} {:.0} {:.0} {}",
+            self.name,
+            if self.sound { "sound" } else { "BROKEN" },
+            r.vertices,
+            q.min_angle_deg,
+            q.max_angle_deg,
+            q.face_max_mm,
+            q.face_rms_mm,
+            q.vertex_max_mm,
+            self.calls(),
+            r.hessians as f64 / r.vertices as f64,
+            self.cells_per,
+            self.ms[0],
+            self.ms[1],
+            self.ms[2],
+            if self.holds() { "" } else { "MISSED" }
+        );
+    }
+}
+
+fn main() {
+    let number = |k: usize, or: usize| std::env::args().nth(k).and_then(|a| a.parse().ok()).unwrap_or(or);
+    let (count, first) = (number(1, 200), number(2, 0));
+    let ctx = Ctx::new(0).unwrap();
+    let benchmark = Phantom { field: fields::anastomosis(), seed: fields::tips()[0], cuts: vec![], euler: 2 };
+    let mut lines = Vec::new();
+    for (name, sizing) in [("benchmark .485", Sizing::Uniform(0.485)), ("benchmark .02", Sizing::Curvature)] {
+        lines.push(run(name, &benchmark, [0.0; 3], sizing, 0.02, &ctx).0);
+    }
+    lines.iter().for_each(Line::show);
+    for i in first..first + count {
+        let mut dice = Dice(i as u64 * 977 + 1);
+        let p = phantom(&mut dice, i);
+        let shift = if i % 12 < 4 { [0.0; 3] } else { [dice.roll(), dice.roll(), dice.roll()] };
+        for (name, sizing) in [("uniform", Sizing::Uniform(dice.between(0.4, 0.6))), ("adaptive", Sizing::Curvature)] {
+            let line = run(&format!("{i} {name}"), &p, shift, sizing, 0.03, &ctx).0;
+            if !line.holds() || i % 20 < 4 {
+                line.show();
+            }
+            lines.push(line);
+        }
+    }
+    let missed = lines.iter().filter(|l| !l.holds()).count();
+    let worst = |f: &dyn Fn(&Line) -> f64| lines.iter().map(f).fold(f64::NEG_INFINITY, f64::max);
+    println!(
+        "{} meshes, {missed} missed; most calls {:.2}, widest angle {:.1}, smallest {:.1}",
+        lines.len(),
+        worst(&Line::calls),
+        worst(&|l| l.quality.max_angle_deg),
+        -worst(&|l| -l.quality.min_angle_deg)
+    );
+    assert!(missed == 0, "{missed} meshes miss a bar");
+}
