@@ -221,8 +221,9 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
     let mut svg = format!(
         "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"surface with medial lines\"><image width=\"{width}\" height=\"{height}\" href=\"data:image/png;base64,{png}\"/>"
     );
+    let mut taken = Vec::new();
     for b in r.morphometry.branches.iter().filter(|b| b.role != Role::Other) {
-        branch_label(&mut svg, r, camera, b);
+        branch_label(&mut svg, r, camera, b, &mut taken);
     }
     scale_bar(&mut svg, camera);
     directions(&mut svg, camera);
@@ -230,8 +231,12 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
     Ok(svg)
 }
 
-/// A branch's name beside the vessel, two thirds along the branch, on the side to which it leans.
-fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &Branch) {
+/// Width of a letter of a label and height of its line, px.
+const LETTER: [f64; 2] = [14.0, 30.0];
+
+/// A branch's name beside the vessel, two thirds along the branch, on the side to which it leans; on the other side where
+/// a name stands already (`taken`: left, right and base line of each).
+fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &Branch, taken: &mut Vec<[f64; 3]>) {
     let Some(e) = r.graph.edges.get(b.id) else { return };
     let n = e.points.len();
     let k = if e.nodes[1] == b.to_node { n * 2 / 3 } else { n.saturating_sub(1 + n * 2 / 3) };
@@ -245,20 +250,33 @@ fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &B
     let ([x, y, _], [x0, y0, _]) = (camera.project(p), camera.project(start));
     let length = (x - x0).hypot(y - y0).max(1e-9);
     let (dx, dy) = ((x - x0) / length, (y - y0) / length);
-    // To the right of a branch that leans right, to the left of any other, under a level one.
-    let side = if dx > 0.02 { 1.0 } else { -1.0 };
-    let (nx, ny) = if dy.abs() > 0.3 { (side * dy.abs(), side * -dx * dy.signum()) } else { (0.0, 1.0) };
     let off = 1.15 * radius / camera.mm_per_px + 14.0;
     let [width, height] = camera.size.map(|n| n as f64);
-    let y = (y + ny * (off + 8.0) + 8.0).clamp(30.0, height - 60.0);
-    let (x, anchor) = if nx == 0.0 {
-        (x.clamp(60.0, width - 60.0), "middle")
-    } else if nx > 0.0 {
-        ((x + nx * off).min(width - 110.0), "start")
-    } else {
-        ((x + nx * off).max(110.0), "end")
+    let words = role_words(b.role);
+    let wide = LETTER[0] * words.len() as f64;
+    let place = |side: f64| {
+        let (nx, ny) = if dy.abs() > 0.3 { (side * dy.abs(), side * -dx * dy.signum()) } else { (0.0, side) };
+        let y = (y + ny * (off + 8.0) + 8.0).clamp(30.0, height - 60.0);
+        if nx == 0.0 {
+            let x = x.clamp(60.0, width - 60.0);
+            (x, y, "middle", [x - 0.5 * wide, x + 0.5 * wide, y])
+        } else if nx > 0.0 {
+            let x = (x + nx * off).min(width - 110.0);
+            (x, y, "start", [x, x + wide, y])
+        } else {
+            let x = (x + nx * off).max(110.0);
+            (x, y, "end", [x - wide, x, y])
+        }
     };
-    label(svg, [x, y], anchor, &hex(role_rgb(b.role)), role_words(b.role));
+    // To the right of a branch that leans right, to the left of any other, under a level one.
+    let first = if dx > 0.02 || dy.abs() <= 0.3 { 1.0 } else { -1.0 };
+    let is_free = |[left, right, y]: [f64; 3]| {
+        taken.iter().all(|t: &[f64; 3]| right < t[0] || left > t[1] || (y - t[2]).abs() > LETTER[1])
+    };
+    let sides = [place(first), place(-first)];
+    let (x, y, anchor, extent) = sides.into_iter().find(|s| is_free(s.3)).unwrap_or(sides[0]);
+    taken.push(extent);
+    label(svg, [x, y], anchor, &hex(role_rgb(b.role)), words);
 }
 
 fn label(svg: &mut String, at: [f64; 2], anchor: &str, colour: &str, words: &str) {
