@@ -67,20 +67,34 @@ pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphomet
         volume_mm3: wall.mesh.volume(),
         displacement_px: Range { min: d.min_mm / pixel_mm, max: d.max_mm / pixel_mm, rms: d.rms_mm / pixel_mm },
         displacement_mm: Range { min: d.min_mm, max: d.max_mm, rms: d.rms_mm },
-        caps: wall.caps.iter().map(|c| cap(c, graph, morphometry)).collect(),
+        caps: caps(wall, graph, morphometry),
     }
 }
 
-/// A cap is named by the role of the branch that ends there.
-fn cap(c: &surface::Cap, graph: &MedialGraph, morphometry: &Morphometry) -> CapFacts {
-    let node = graph.nodes.iter().position(|n| n.cap == Some(c.face_id));
-    let branch = morphometry.branches.iter().find(|b| node.is_some_and(|n| b.from_node == n || b.to_node == n));
-    let name = match branch.map(|b| (b.role, b.id)) {
-        Some((Role::Other, id)) => format!("end_branch_{id}"),
-        Some((role, _)) => format!("end_{}", role.name()),
-        None => format!("end_{}", c.face_id),
+/// A cap is named by the role of the branch that ends there; by the branch's number where several caps have that role,
+/// or by its own where no branch ends.
+fn caps(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapFacts> {
+    let branch = |c: &surface::Cap| {
+        let face = wall.beside.iter().find(|b| b[0] == c.face_id).map_or(c.face_id, |b| b[1]);
+        let node = graph.nodes.iter().position(|n| n.cap == Some(face))?;
+        morphometry.branches.iter().find(|b| b.from_node == node || b.to_node == node).map(|b| (b.role, b.id))
     };
-    CapFacts { face_id: c.face_id, name, centroid: c.centroid, normal: c.plane.outward, area_mm2: c.area_mm2 }
+    let branches: Vec<Option<(Role, usize)>> = wall.caps.iter().map(branch).collect();
+    let count = |wanted: &dyn Fn((Role, usize)) -> bool| branches.iter().flatten().filter(|b| wanted(**b)).count();
+    let name = |i: usize| match branches[i] {
+        Some((role, _)) if role != Role::Other && count(&|b| b.0 == role) == 1 => format!("end_{}", role.name()),
+        Some((_, id)) if count(&|b| b.1 == id) == 1 => format!("end_branch_{id}"),
+        Some((_, id)) => format!("end_branch_{id}_cap_{}", wall.caps[i].face_id),
+        None => format!("end_{}", wall.caps[i].face_id),
+    };
+    let fact = |(i, c): (usize, &surface::Cap)| CapFacts {
+        face_id: c.face_id,
+        name: name(i),
+        centroid: c.centroid,
+        normal: c.plane.outward,
+        area_mm2: c.area_mm2,
+    };
+    wall.caps.iter().enumerate().map(fact).collect()
 }
 
 pub(crate) fn patches(p: &surface::Patches) -> Patches<'_> {

@@ -21,6 +21,8 @@ use surface::{Bounded, Displacement, PolygoniseSettings, Quality, RemeshSettings
 pub(crate) struct Wall {
     pub(crate) mesh: TriMesh,
     pub(crate) caps: Vec<surface::Cap>,
+    /// Caps (face ids) that share a corner of the volume with a larger one: the same vessel ends at both.
+    pub(crate) beside: Vec<[u32; 2]>,
     pub(crate) topology: Topology,
     pub(crate) quality: Quality,
     pub(crate) displacement: Displacement,
@@ -189,7 +191,23 @@ fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, c
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
     let ids: Vec<u32> = (0..report.caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
-    Ok(Wall { mesh, caps: report.caps, topology, quality, displacement, patches })
+    let beside = beside(&mesh, &report.caps);
+    Ok(Wall { mesh, caps: report.caps, beside, topology, quality, displacement, patches })
+}
+
+/// Caps that share a rim vertex with a larger one, with the largest such: a vessel that leaves the volume across an edge
+/// of it is cut by two planes, and has one end.
+fn beside(mesh: &TriMesh, caps: &[surface::Cap]) -> Vec<[u32; 2]> {
+    let mut at: Vec<Vec<u32>> = vec![Vec::new(); mesh.vertices.len()];
+    for (t, &id) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id != surface::WALL) {
+        t.iter().for_each(|&v| at[v as usize].push(id));
+    }
+    let area = |id: u32| caps.iter().find(|c| c.face_id == id).map_or(0.0, |c| c.area_mm2);
+    let order = |a: &u32, b: &u32| area(*a).total_cmp(&area(*b)).then(b.cmp(a));
+    let larger = |id: u32| at.iter().filter(|ids| ids.contains(&id)).flatten().copied().max_by(order).unwrap_or(id);
+    // three planes meet in a corner: the largest may be reached over the middle one
+    let largest = |id: u32| (0..3).fold(id, |id, _| larger(id));
+    caps.iter().map(|c| [c.face_id, largest(c.face_id)]).filter(|[id, largest]| id != largest).collect()
 }
 
 /// The wall's stage calls two crates.
@@ -233,6 +251,7 @@ fn medial_lines(
     let caps: Vec<CapHint> = wall
         .caps
         .iter()
+        .filter(|c| wall.beside.iter().all(|&[small, _]| small != c.face_id))
         .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
         .collect();
     let seeds = within(contours, f.inner());

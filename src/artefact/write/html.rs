@@ -80,18 +80,14 @@ struct SliceView {
 /// [`Error::Mismatch`] for a slice picture whose pixels do not fit its size; [`Error::Encode`].
 pub fn report_html(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
     super::geometry::checked_mesh(REPORT_HTML, r.surface.mesh)?;
-    let warnings = r.all_warnings();
+    let warnings = warning_lines(r);
     let main = r.main_junction();
     let others: Vec<&Junction> =
         r.morphometry.junctions.iter().filter(|j| main.is_none_or(|m| !std::ptr::eq(*j, m))).collect();
     let page = Page {
         digest: r.input.digest.clone(),
         more_warnings: warnings.len().saturating_sub(WARNINGS),
-        warnings: warnings
-            .iter()
-            .take(WARNINGS)
-            .map(|w| if w.place.is_none() { w.message.clone() } else { format!("{} ({})", w.message, w.place) })
-            .collect(),
+        warnings: warnings.into_iter().take(WARNINGS).collect(),
         views: views(r)?,
         legend: legend(r),
         junction: main.map(angle_table),
@@ -211,6 +207,24 @@ fn views(r: &Reconstruction<'_>) -> Result<Vec<View>, Error> {
         .iter()
         .zip(titles)
         .map(|(camera, title)| Ok(View { title: title.to_owned(), svg: view_svg(r, camera)? }))
+        .collect()
+}
+
+/// The first warning of each code, with its place and the number of others like it.
+fn warning_lines(r: &Reconstruction<'_>) -> Vec<String> {
+    let all = r.all_warnings();
+    let mut kinds: Vec<(&str, String, usize)> = Vec::new();
+    for w in &all {
+        if let Some(kind) = kinds.iter_mut().find(|k| k.0 == w.code) {
+            kind.2 += 1;
+            continue;
+        }
+        let line = if w.place.is_none() { w.message.clone() } else { format!("{} ({})", w.message, w.place) };
+        kinds.push((w.code, line, 0));
+    }
+    kinds
+        .into_iter()
+        .map(|(_, line, more)| if more == 0 { line } else { format!("{line}; {more} more like it") })
         .collect()
 }
 
