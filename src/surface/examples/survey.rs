@@ -39,7 +39,7 @@ fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f
     ms[1] = t.elapsed().as_secs_f64() * 1e3;
     let t = Instant::now();
     let s = RemeshSettings { sizing, max_error_mm, ..RemeshSettings::default() };
-    let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx).unwrap();
+    let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx)?;
     ms[2] = t.elapsed().as_secs_f64() * 1e3;
     let topology = check(&mesh).unwrap();
     let sound =
