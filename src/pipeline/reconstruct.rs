@@ -13,9 +13,11 @@ use implicit::{Field, Sampled, Smoothing, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
-use space::{FaultKind, P3, Warning};
+use space::{FaultKind, Faulty, P3, Warning};
 use std::path::{Path, PathBuf};
-use surface::{Bounded, Displacement, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh};
+use surface::{
+    Bounded, Displacement, Extension, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh,
+};
 
 /// The surface with all that is known of it.
 pub(crate) struct Wall {
@@ -27,6 +29,10 @@ pub(crate) struct Wall {
     pub(crate) quality: Quality,
     pub(crate) displacement: Displacement,
     pub(crate) patches: surface::Patches,
+    /// The wall with flow extensions, where they were asked for and have room.
+    pub(crate) extended: Option<surface::Extended>,
+    /// Why there are none, where they were asked for.
+    pub(crate) warnings: Vec<Warning>,
 }
 
 /// The whole reconstruction: reads `inputs`, writes every artefact into the folder `out`, which appears whole or not at
@@ -64,7 +70,7 @@ fn reconstruct(
         .step("measure", |ctx| morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx))?;
 
     let warnings: Vec<Warning> =
-        [input.warnings.clone(), segmentation.warnings.clone(), medial.warnings].into_iter().flatten().collect();
+        [input.warnings.clone(), segmentation.warnings.clone(), wall.warnings.clone(), medial.warnings].concat();
     let mut files = steps.step("write", |_| {
         write::write_all(&Reconstruction {
             input: facts::input(&input),
@@ -78,6 +84,7 @@ fn reconstruct(
             pictures: write::slice_pictures(&stack, &contours)?,
         })
     })?;
+    files.extend(variants(&wall).map_err(|e| Failure::of(&e))?);
     let result = files
         .first()
         .and_then(|f| serde_json::from_slice(&f.bytes).ok())
@@ -97,15 +104,31 @@ fn reconstruct(
     Ok((files, result))
 }
 
+/// The surface in its other forms: open, and with flow extensions.
+fn variants(wall: &Wall) -> Result<Vec<NamedBytes>, write::Error> {
+    let mut files = vec![write::mesh_vtp(write::SURFACE_OPEN_VTP, &surface::open(&wall.mesh))?];
+    if let Some(e) = &wall.extended {
+        files.push(write::mesh_vtp(write::SURFACE_EXTENDED_VTP, &e.mesh)?);
+    }
+    Ok(files)
+}
+
 /// What this version cannot make is refused, not left out in silence.
 fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
-    if !plan.outputs.iter().any(|o| o == "volume") {
-        return Ok(());
+    let refuse = |field: &str, message: &str| {
+        let mut failure = Failure::new(FaultKind::Input, "plan.unsupported", message.to_owned());
+        failure.place = space::Place::field(field);
+        Err(failure)
+    };
+    if plan.outputs.iter().any(|o| o == "volume") {
+        return refuse("outputs", "this version makes no volume mesh: leave `volume` out of the plan's outputs");
     }
-    let message = "this version makes no volume mesh: leave `volume` out of the plan's outputs".to_owned();
-    let mut failure = Failure::new(FaultKind::Input, "plan.unsupported", message);
-    failure.place = space::Place::field("outputs");
-    Err(failure)
+    if !plan.ends.cut_mm.is_empty() {
+        let message = "this version cuts where the data end and nowhere else: leave ends.cut_mm empty, \
+                       and leave slices out (segmentation.exclude_slices) to end a vessel sooner";
+        return refuse("ends.cut_mm", message);
+    }
+    Ok(())
 }
 
 /// The function past the data's ends means nothing: close it just outside the cuts.
@@ -191,8 +214,33 @@ fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, c
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
     let ids: Vec<u32> = (0..report.caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
+    let (extended, warnings) = extended(&mesh, field, report.caps.len() as u32, plan, ctx)?;
     let beside = beside(&mesh, &report.caps);
-    Ok(Wall { mesh, caps: report.caps, beside, topology, quality, displacement, patches })
+    Ok(Wall { mesh, caps: report.caps, beside, topology, quality, displacement, patches, extended, warnings })
+}
+
+/// Flow extensions at every cap. They are for solvers: where one has no room the numbers of the scan still stand, so
+/// that it is a warning here.
+fn extended(
+    mesh: &TriMesh,
+    field: &Sampled,
+    caps: u32,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<(Option<surface::Extended>, Vec<Warning>), surface::Error> {
+    let diameters = plan.ends.extension_diameters;
+    if diameters <= 0.0 || caps == 0 {
+        return Ok((None, Vec::new()));
+    }
+    let wanted: Vec<Extension> = (1..=caps).map(|face_id| Extension { face_id, diameters }).collect();
+    match surface::extend(mesh, field, &wanted, ctx) {
+        Ok(e) => Ok((Some(e), Vec::new())),
+        Err(e) if e.kind() == FaultKind::Cancelled => Err(e),
+        Err(e) => {
+            let message = format!("no surface_extended.vtp: {e}");
+            Ok((None, vec![Warning { code: e.code(), message, place: e.place() }]))
+        }
+    }
 }
 
 /// Caps that share a rim vertex with a larger one, with the largest such: a vessel that leaves the volume across an edge

@@ -75,7 +75,7 @@ pub(crate) fn recap(web: &Web, flats: &[Flat]) -> Result<TriMesh, Error> {
 }
 
 /// Close every rim of one plane.
-fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<(), Error> {
+pub(crate) fn close(mesh: &mut TriMesh, rims: &[Rim], plane: &Flat) -> Result<(), Error> {
     let (e, f) = plane.normal.any_orthonormal_pair();
     // (e, f, normal) right-handed, so that counterclockwise in the plane faces outward.
     let f = if e.cross(f).dot(plane.normal) < 0.0 { -f } else { f };

@@ -68,7 +68,8 @@ const GRAZING: f64 = 0.1;
 /// closed by a planar cap.
 ///
 /// The result is closed, oriented outward; wall faces have id [`WALL`], caps ids from 1, ordered by the place of their
-/// centroid (z, then y, then x, ascending), so ids do not depend on the order of the planes. Rim vertices lie on f = 0
+/// centroid (z, then y, then x, ascending, .5 mm counting as equal), so ids depend neither on the order of the planes nor
+/// on the mesh. Rim vertices lie on f = 0
 /// (|f| / |grad f| <= 1e-9 mm) and in their plane (1e-12 mm). Caps hold only rim vertices until [`crate::remesh`].
 ///
 /// # Errors
@@ -275,6 +276,19 @@ pub(crate) fn loops(edges: &BTreeMap<u32, u32>) -> Vec<Vec<u32>> {
     loops
 }
 
+/// Coordinates of cap centres that differ by less count as equal, mm: caps in one plane differ by rounding alone, and the
+/// same cap on two meshes by up to .05 mm.
+const SAME_PLACE_MM: f64 = 0.5;
+
+/// Sort by the first axis in runs without gaps of [`SAME_PLACE_MM`], each run by the next axis.
+fn by_place(order: &mut [usize], place: &impl Fn(usize) -> [f64; 3], axes: &[usize]) {
+    let Some((&axis, rest)) = axes.split_first() else { return };
+    order.sort_by(|&i, &j| place(i)[axis].total_cmp(&place(j)[axis]));
+    for run in order.chunk_by_mut(|&i, &j| place(j)[axis] - place(i)[axis] < SAME_PLACE_MM) {
+        by_place(run, place, rest);
+    }
+}
+
 /// Number the caps by the places of their centroids and describe them.
 fn number(mesh: &mut TriMesh, flats: &[Flat]) -> Result<Vec<Cap>, Error> {
     let web = Web::weave(mesh)?;
@@ -303,10 +317,7 @@ fn number(mesh: &mut TriMesh, flats: &[Flat]) -> Result<Vec<Cap>, Error> {
         cap.centroid = P3::from_raw(cap.centroid.raw() / cap.area_mm2);
     }
     let place = |p: usize| caps[p].as_ref().map_or([0.0; 3], |c| c.centroid.to_array());
-    order.sort_by(|&i, &j| {
-        let (a, b) = (place(i), place(j));
-        a[2].total_cmp(&b[2]).then(a[1].total_cmp(&b[1])).then(a[0].total_cmp(&b[0]))
-    });
+    by_place(&mut order, &place, &[2, 1, 0]);
     let mut id_of = vec![WALL; count];
     let mut out = Vec::with_capacity(order.len());
     for (i, &p) in order.iter().enumerate() {
@@ -402,6 +413,52 @@ mod tests {
         // The host's section is a circle; its polygon is a little smaller.
         let area = std::f64::consts::PI * 9.0;
         assert!((one.caps[1].area_mm2 - area).abs() < 0.03 * area || (one.caps[2].area_mm2 - area).abs() < 0.03 * area);
+    }
+
+    #[test]
+    fn caps_in_one_plane_are_numbered_across_it_whatever_the_mesh() {
+        let ctx = Ctx::new(2).unwrap();
+        let field = fields::anastomosis();
+        for cell_mm in [0.45, 0.6, 0.7] {
+            let caps = cut(&wall(&field, fields::tips()[0], cell_mm, &ctx), &field, &ends(15.03), &ctx).unwrap().1.caps;
+            assert_eq!(caps.len(), 3);
+            assert!(caps[1].centroid.x() < 1.0 && caps[2].centroid.x() > 10.0, "{caps:?}");
+        }
+    }
+
+    #[test]
+    fn any_plane_cuts_or_is_refused_with_a_reason() {
+        use space::Faulty;
+        let ctx = Ctx::new(2).unwrap();
+        let field = fields::anastomosis();
+        let mesh = wall(&field, fields::tips()[0], 0.6, &ctx);
+        let mut dice = crate::phantoms::Dice(11);
+        let mut done = 0;
+        for _ in 0..20 {
+            let plane = |dice: &mut crate::phantoms::Dice| {
+                let mut roll = |half: f64| dice.between(-half, half);
+                let n = V3::new(roll(1.0), roll(1.0), roll(1.0)).normalised().unwrap();
+                CutPlane { point: P3::ORIGIN + n * roll(9.0).abs(), outward: n }
+            };
+            let mut cuts = vec![plane(&mut dice), plane(&mut dice), plane(&mut dice)];
+            let outcome = |cuts: &[CutPlane]| match cut(&mesh, &field, cuts, &ctx) {
+                Ok((m, r)) => {
+                    assert!(topology(&m).is_ok());
+                    r.caps.len()
+                }
+                Err(e) => {
+                    let known =
+                        ["surface.grazing_cut", "surface.nested_rims", "surface.nothing_left", "surface.crossed_rim"];
+                    assert!(known.contains(&e.code()), "{e}");
+                    assert!(e.place().position.is_some(), "{e}");
+                    0
+                }
+            };
+            done += usize::from(outcome(&cuts) > 0);
+            cuts.reverse();
+            outcome(&cuts);
+        }
+        assert!(done >= 8, "{done} of 20");
     }
 
     #[test]

@@ -110,8 +110,8 @@ pub enum Error {
     },
     /// A rim crosses itself or another rim.
     #[error(
-        "the rim at cut plane {plane} crosses itself: the wall is rougher there than the mesh resolves; \
-         use smaller cells, smooth more or move the cut"
+        "the rim at cut plane {plane} crosses itself: the plane only just clips the wall there, or the wall is rougher \
+         than the mesh resolves; move the cut by a millimetre or more, or smooth more"
     )]
     CrossedRim {
         /// Plane number in the order given.
@@ -149,6 +149,45 @@ pub enum Error {
         /// A place of the densest mesh.
         at: P3,
     },
+    /// The wall at an end runs too obliquely to its cut plane.
+    #[error(
+        "the vessel leaves through cap {face_id} at {angle_deg:.0} degrees to the cut's normal: no duct can carry its \
+         section on; cut the end more squarely or set ends.extension_diameters to 0"
+    )]
+    ObliqueEnd {
+        /// Face id of the cap.
+        face_id: u32,
+        /// Angle between the vessel and the cut's normal, degrees.
+        angle_deg: f64,
+        /// Centre of the cap.
+        at: P3,
+    },
+    /// An extension shorter than the cut is oblique.
+    #[error(
+        "the extension at cap {face_id} must be at least {need_diameters:.2} diameters long to end in a plane across the \
+         vessel: raise ends.extension_diameters or set it to 0"
+    )]
+    ShortEnd {
+        /// Face id of the cap.
+        face_id: u32,
+        /// Least length, diameters.
+        need_diameters: f64,
+        /// Centre of the cap.
+        at: P3,
+    },
+    /// An extension passes through the wall or another extension.
+    #[error(
+        "the extension at cap {face_id} runs into another vessel after {after_diameters:.1} diameters: \
+         set ends.extension_diameters lower or cut that end elsewhere"
+    )]
+    ExtensionMeets {
+        /// Face id of the cap.
+        face_id: u32,
+        /// Way along the extension to the first meeting, diameters.
+        after_diameters: f64,
+        /// Where.
+        at: P3,
+    },
     /// The harmonic functions of the patches have no solution.
     #[error("the patch equations of {unknowns} vertices cannot be solved ({reason}): remesh with another edge_mm")]
     PatchSolve {
@@ -177,7 +216,9 @@ impl Faulty for Error {
     fn kind(&self) -> FaultKind {
         match self {
             Self::Cancelled => FaultKind::Cancelled,
-            Self::Settings { .. } => FaultKind::Input,
+            Self::Settings { .. } | Self::ObliqueEnd { .. } | Self::ShortEnd { .. } | Self::ExtensionMeets { .. } => {
+                FaultKind::Input
+            }
             Self::TooManyCells { .. } | Self::TooManyTriangles { .. } => FaultKind::Limit,
             Self::CapPlane { .. } | Self::PatchIds { .. } => FaultKind::Internal,
             _ => FaultKind::Numeric,
@@ -200,6 +241,9 @@ impl Faulty for Error {
             Self::NothingLeft { .. } => "surface.nothing_left",
             Self::CapPlane { .. } => "surface.cap_plane",
             Self::TooManyTriangles { .. } => "surface.too_many_triangles",
+            Self::ObliqueEnd { .. } => "surface.oblique_end",
+            Self::ShortEnd { .. } => "surface.short_end",
+            Self::ExtensionMeets { .. } => "surface.extension_meets",
             Self::PatchSolve { .. } => "surface.patch_solve",
             Self::PatchIds { .. } => "surface.patch_ids",
         }
@@ -214,6 +258,9 @@ impl Faulty for Error {
             | Self::CrossedRim { at, .. }
             | Self::NothingLeft { at, .. }
             | Self::CapPlane { at, .. }
+            | Self::ObliqueEnd { at, .. }
+            | Self::ShortEnd { at, .. }
+            | Self::ExtensionMeets { at, .. }
             | Self::TooManyTriangles { at, .. } => Place::at(*at),
             Self::Projection { vertex, at, .. } => Place { element: Some(*vertex), ..Place::at(*at) },
             Self::Folded { face, at } => Place { element: Some(*face), ..Place::at(*at) },

@@ -17,6 +17,9 @@ use space::P3;
 /// triangles were better: a uniform .5 mm mesh over the acute crotch (radius of curvature .34 mm) needs down to .5.
 pub(crate) const FACING: f64 = 0.4;
 
+/// Mark of a vertex that may not move at all.
+const FROZEN: u8 = u8::MAX;
+
 /// How a vertex may move.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Seat {
@@ -41,6 +44,8 @@ pub(crate) struct Fabric<'a> {
     /// Edges at each vertex across which the face id changes: 0 within a face, 2 on a curve, else a corner. Split, flip
     /// and collapse as they are allowed here never change it for a vertex that stays.
     pub(crate) marks: Vec<u8>,
+    /// By face id, whether its triangles may change; all may when empty.
+    pub(crate) pliable: Vec<bool>,
     /// Calls of (f, grad f), and of (f, grad f, second derivatives).
     pub(crate) evaluations: usize,
     pub(crate) hessians: usize,
@@ -109,11 +114,28 @@ impl<'a> Fabric<'a> {
             normal: vec![DVec3::ZERO; n],
             size: vec![0.0; n],
             marks,
+            pliable: Vec::new(),
             evaluations: 0,
             hessians: 0,
         };
         fabric.mesh_normals();
         Ok(fabric)
+    }
+
+    /// Let only the faces of some ids change, and only inside them: every vertex on another id or on a rim is fixed.
+    pub(crate) fn freeze(&mut self, pliable: &[bool]) {
+        self.pliable = pliable.to_vec();
+        for h in 0..self.web.origin.len() {
+            if !self.may_change(h as u32) || self.web.is_feature(h as u32) {
+                let next = self.web.target(h as u32);
+                [self.web.origin[h], next].iter().for_each(|&v| self.marks[v as usize] = FROZEN);
+            }
+        }
+    }
+
+    /// Whether the triangle left of a half-edge may change.
+    pub(crate) fn may_change(&self, h: u32) -> bool {
+        self.pliable.is_empty() || self.pliable.get(self.web.id(h) as usize) == Some(&true)
     }
 
     /// Normals of the wall from its triangles, where f has not been asked yet.
@@ -158,6 +180,9 @@ impl<'a> Fabric<'a> {
 
     /// How a vertex may move.
     pub(crate) fn seat(&self, v: u32) -> Seat {
+        if self.marks[v as usize] == FROZEN {
+            return Seat::Fixed;
+        }
         if self.marks[v as usize] == 0 {
             return Seat::Face(self.tie([self.web.id(self.web.leaving[v as usize]); 2]));
         }
@@ -192,9 +217,12 @@ impl<'a> Fabric<'a> {
         (0..self.web.at.len() as u32).filter(|&v| self.web.leaving[v as usize] != NONE).collect()
     }
 
-    /// Living edges, each by its half-edge of smaller number.
+    /// Living edges that may change, each by its half-edge of smaller number.
     pub(crate) fn edges(&self) -> impl Iterator<Item = u32> + '_ {
-        (0..self.web.origin.len() as u32).filter(|&h| self.web.lives(h) && h < self.web.twin[h as usize])
+        (0..self.web.origin.len() as u32).filter(|&h| {
+            let t = self.web.twin[h as usize];
+            self.web.lives(h) && h < t && self.may_change(h) && self.may_change(t)
+        })
     }
 
     /// Mean length of the living edges, mm.

@@ -8,6 +8,7 @@
 mod cap;
 mod cut;
 mod distance;
+mod ends;
 mod error;
 mod fabric;
 #[cfg(test)]
@@ -23,6 +24,7 @@ mod polish;
 mod polygonise;
 mod quality;
 mod remesh;
+mod ring;
 mod sizing;
 mod sparse;
 #[cfg(test)]
@@ -33,6 +35,7 @@ mod web;
 pub use cap::Bounded;
 pub use cut::{Cap, CutReport, cut};
 pub use distance::{Displacement, displacement};
+pub use ends::{Extended, Extension, ExtensionReport, extend, open};
 pub use error::Error;
 pub use intersect::self_intersections;
 pub use land::{ProjectReport, project};

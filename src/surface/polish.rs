@@ -23,7 +23,7 @@ pub(crate) fn polish(fabric: &mut Fabric<'_>, goal_deg: f64, rounds: usize, ctx:
     let mut total = 0;
     for _ in 0..rounds {
         let mut bad: Vec<(f64, usize)> = (0..fabric.web.face_id.len())
-            .filter(|&t| fabric.web.face_id[t] != GONE)
+            .filter(|&t| fabric.web.face_id[t] != GONE && fabric.may_change(3 * t as u32))
             .filter_map(|t| Some((badness(fabric, t, goal)?, t)))
             .collect();
         bad.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));

@@ -127,13 +127,14 @@ pub fn remesh(
     finish(fabric, mended, longest, ctx)
 }
 
-/// Share of triangles below [`SLIVER`] above which a mesh is taken for a raw one: lattice meshes have 20 % and more.
-const RAW: f64 = 0.05;
+/// Share of triangles below [`SLIVER`] above which a mesh is taken for a raw one: lattice meshes have 10 % and more,
+/// remeshed ones none.
+const RAW: f64 = 0.02;
 /// Raw meshes are thinned out to this times their mean edge (.3 mm at a cell of .5 mm): the second derivatives are then
 /// asked for at 1.1 times the final number of vertices, at 1 it was 2.8 times.
 const THIN: f64 = 1.6;
-/// Cotangent of 10 degrees.
-const SLIVER: f64 = 5.67;
+/// Cotangent of 20 degrees.
+const SLIVER: f64 = 2.75;
 
 /// First landing and sizes. A raw lattice mesh has two to three times the vertices that are wanted: it is thinned out
 /// before f is asked.

@@ -11,7 +11,7 @@
 
 use super::error::same_length;
 use super::vtp::{Array, PolyData};
-use super::{CONTOURS_VTP, Error, SKELETON_VTP, SURFACE_VTP};
+use super::{CONTOURS_VTP, Error, NamedBytes, SKELETON_VTP, SURFACE_VTP};
 use crate::Reconstruction;
 use imaging::Contours;
 use morphometry::{Branch, Role, Section};
@@ -87,6 +87,22 @@ pub fn surface_vtp(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
         ..PolyData::default()
     };
     data.write(SURFACE_VTP)
+}
+
+/// A surface without measures (opened, or with flow extensions): `Normals`, and `FaceId` as in surface.vtp.
+///
+/// # Errors
+/// [`Error::Mismatch`], [`Error::NotFinite`].
+pub fn mesh_vtp(name: &'static str, mesh: &TriMesh) -> Result<NamedBytes, Error> {
+    checked_mesh(name, mesh)?;
+    let data = PolyData {
+        points: mesh.vertices.clone(),
+        polygons: mesh.triangles.clone(),
+        point_arrays: vec![Array::triple("Normals", vertex_normals(mesh).into_iter().map(V3::to_array))],
+        cell_arrays: vec![Array::id("FaceId", mesh.face_id.iter().map(|&f| f as usize))],
+        ..PolyData::default()
+    };
+    Ok(NamedBytes { name, bytes: data.write(name)? })
 }
 
 /// Abscissas of the points of a polyline, mm.

@@ -31,7 +31,7 @@ mod tests;
 
 pub use self::csv::angles_csv;
 pub use error::Error;
-pub use geometry::{skeleton_vtp, surface_vtp};
+pub use geometry::{mesh_vtp, skeleton_vtp, surface_vtp};
 pub use glb::{gltf_position, surface_glb};
 pub use html::report_html;
 pub use json::DIGITS;
@@ -58,6 +58,10 @@ pub const SURFACE_VTP: &str = "surface.vtp";
 pub const SURFACE_GLB: &str = "surface.glb";
 /// The surface for everything else.
 pub const SURFACE_STL: &str = "surface.stl";
+/// The wall alone, its ends open, for programs that cap or extend themselves.
+pub const SURFACE_OPEN_VTP: &str = "surface_open.vtp";
+/// The surface with flow extensions, closed; caps carry the face ids of surface.vtp.
+pub const SURFACE_EXTENDED_VTP: &str = "surface_extended.vtp";
 /// The contours for VTK.
 pub const CONTOURS_VTP: &str = "contours.vtp";
 /// The page to read and print.

@@ -1,6 +1,7 @@
 //! The surface over many random phantoms and lattice shifts: shapes, evaluations and times.
 //!
-//! `cargo run --release -p surface --example survey -- [COUNT] [FIRST]`; one line per mesh, the worst of all at the end.
+//! `cargo run --release -p surface --example survey -- [COUNT] [FIRST] [FOLDER]`; one line per mesh, the worst of all at the
+//! end; with a folder, every mesh as OFF for other judges.
 //! Ends with a fault when a bar of the surface is missed.
 #![allow(missing_docs, clippy::unwrap_used)]
 
@@ -24,20 +25,21 @@ struct Line {
     sound: bool,
     least: f64,
     ms: [f64; 3],
+    mesh: TriMesh,
 }
 
-fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f64, ctx: &Ctx) -> (Line, TriMesh) {
+fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f64, ctx: &Ctx) -> Result<Line, Error> {
     let s = PolygoniseSettings { shift, ..PolygoniseSettings::default() };
     let mut ms = [0.0; 3];
     let t = Instant::now();
     let (raw, polygonised) = polygonise(&p.field, &[p.seed], &s, ctx).unwrap();
     ms[0] = t.elapsed().as_secs_f64() * 1e3;
     let t = Instant::now();
-    let closed = if p.cuts.is_empty() { raw } else { cut(&raw, &p.field, &p.cuts, ctx).unwrap().0 };
+    let closed = if p.cuts.is_empty() { raw } else { cut(&raw, &p.field, &p.cuts, ctx)?.0 };
     ms[1] = t.elapsed().as_secs_f64() * 1e3;
     let t = Instant::now();
     let s = RemeshSettings { sizing, max_error_mm, ..RemeshSettings::default() };
-    let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx).unwrap();
+    let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx)?;
     ms[2] = t.elapsed().as_secs_f64() * 1e3;
     let topology = check(&mesh).unwrap();
     let sound =
@@ -45,7 +47,7 @@ fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f
     let least = if matches!(sizing, Sizing::Curvature) { 30.0 } else { 33.0 };
     let cells_per = polygonised.cells_visited as f64 / polygonised.cells as f64;
     let quality = quality(&mesh, &p.field, ctx).unwrap();
-    (Line { name: name.into(), quality, report, cells_per, sound, least, ms }, mesh)
+    Ok(Line { name: name.into(), quality, report, cells_per, sound, least, ms, mesh })
 }
 
 impl Line {
@@ -83,36 +85,60 @@ impl Line {
     }
 }
 
-fn main() {
-    let number = |k: usize, or: usize| std::env::args().nth(k).and_then(|a| a.parse().ok()).unwrap_or(or);
-    let (count, first) = (number(1, 200), number(2, 0));
-    let ctx = Ctx::new(0).unwrap();
-    let benchmark = Phantom { field: fields::anastomosis(), seed: fields::tips()[0], cuts: vec![], euler: 2 };
-    let mut lines = Vec::new();
-    for (name, sizing) in [("benchmark .485", Sizing::Uniform(0.485)), ("benchmark .02", Sizing::Curvature)] {
-        lines.push(run(name, &benchmark, [0.0; 3], sizing, 0.02, &ctx).0);
+/// Geomview's OFF, for programs that judge or compete.
+fn off(mesh: &TriMesh) -> String {
+    let mut text = format!("OFF\n{} {} 0\n", mesh.vertices.len(), mesh.triangles.len());
+    for p in &mesh.vertices {
+        let [x, y, z] = p.to_array();
+        text += &format!("{x:?} {y:?} {z:?}\n");
     }
-    lines.iter().for_each(Line::show);
+    mesh.triangles.iter().for_each(|[a, b, c]| text += &format!("3 {a} {b} {c}\n"));
+    text
+}
+
+fn main() {
+    let argument = |k: usize| std::env::args().nth(k);
+    let number = |k: usize, or: usize| argument(k).and_then(|a| a.parse().ok()).unwrap_or(or);
+    let (count, first, folder) = (number(1, 200), number(2, 0), argument(3));
+    let ctx = Ctx::new(0).unwrap();
+    let (mut lines, mut refused) = (Vec::new(), 0);
+    let mut keep = |line: Result<Line, Error>, name: &str, always: bool| match line {
+        Ok(line) => {
+            if !line.holds() || always {
+                line.show();
+            }
+            if let Some(folder) = &folder {
+                std::fs::write(format!("{folder}/{}.off", line.name.replace(' ', "-")), off(&line.mesh)).unwrap();
+            }
+            lines.push(Line { mesh: TriMesh::default(), ..line });
+        }
+        // A plane that only just clips a vessel's tip: the fault is the right answer.
+        Err(e) => {
+            println!("{name:<16} refused: {e}");
+            refused += 1;
+        }
+    };
+    let benchmark = Phantom { field: fields::anastomosis(), seed: fields::tips()[0], cuts: vec![], euler: 2 };
+    for (name, sizing) in [("benchmark-.485", Sizing::Uniform(0.485)), ("benchmark-.02", Sizing::Curvature)] {
+        keep(run(name, &benchmark, [0.0; 3], sizing, 0.02, &ctx), name, true);
+    }
     for i in first..first + count {
         let mut dice = Dice(i as u64 * 977 + 1);
         let p = phantom(&mut dice, i);
         let shift = if i % 12 < 4 { [0.0; 3] } else { [dice.roll(), dice.roll(), dice.roll()] };
         for (name, sizing) in [("uniform", Sizing::Uniform(dice.between(0.4, 0.6))), ("adaptive", Sizing::Curvature)] {
-            let line = run(&format!("{i} {name}"), &p, shift, sizing, 0.03, &ctx).0;
-            if !line.holds() || i % 20 < 4 {
-                line.show();
-            }
-            lines.push(line);
+            let name = format!("{i}-{name}");
+            keep(run(&name, &p, shift, sizing, 0.03, &ctx), &name, i % 20 < 4);
         }
     }
     let missed = lines.iter().filter(|l| !l.holds()).count();
     let worst = |f: &dyn Fn(&Line) -> f64| lines.iter().map(f).fold(f64::NEG_INFINITY, f64::max);
     println!(
-        "{} meshes, {missed} missed; most calls {:.2}, widest angle {:.1}, smallest {:.1}",
+        "{} meshes, {missed} missed, {refused} refused; most calls {:.2}, angles {:.1} to {:.1}",
         lines.len(),
         worst(&Line::calls),
+        -worst(&|l| -l.quality.min_angle_deg),
         worst(&|l| l.quality.max_angle_deg),
-        -worst(&|l| -l.quality.min_angle_deg)
     );
     assert!(missed == 0, "{missed} meshes miss a bar");
 }
