@@ -31,8 +31,8 @@ const AXIS_RADII: f64 = 3.0;
 const PROXIMAL_WEIGHT: f64 = 0.02;
 const PROXIMAL_STEPS: usize = 20;
 /// How far a junction may move to the crossing of the axes, in its inscribed radii: thinning puts it towards the crotch,
-/// 1.3 radii from the crossing for a graft at 45 degrees.
-const JUNCTION_REACH_RADII: f64 = 2.5;
+/// 1.3 radii from the crossing for a graft at 45 degrees, 4.3 for one at 20 (the crotch itself lies 1 / tan 10 = 5.7 out).
+const JUNCTION_REACH_RADII: f64 = 6.0;
 
 /// A medial line while it is recentred.
 #[derive(Clone)]
