@@ -10,6 +10,7 @@ mod graph;
 mod lumen;
 mod masks;
 mod medial;
+mod pinholes;
 mod prune;
 mod recentre;
 mod settings;

@@ -21,8 +21,9 @@ const TANGENT_RADII: f64 = 0.5;
 /// A section this much larger than the median of those one to three radii farther out belongs to the junction. A taper
 /// of 1 : 28 in radius passes.
 const SWELLING: f64 = 1.15;
-/// How far from a junction swelling is looked for, in the junction's inscribed radii.
-const SWELLING_RADII: f64 = 4.0;
+/// How far from a junction swelling is looked for, in the junction's inscribed radii: the lumens of a graft at 20 degrees
+/// part 5.7 radii out.
+const SWELLING_RADII: f64 = 8.0;
 /// Length of the line through the centres next to a junction, in their radii. Short enough for bends of ten radii (.11
 /// radius off), long enough to average the ripple of a noisy wall.
 const AXIS_RADII: f64 = 3.0;
@@ -179,7 +180,9 @@ fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius
     let from_end = |i: usize| if end == 0 { s[i] } else { length - s[n - 1 - i] };
     let area = |sections: &[Option<Section>], i: usize| sections[index(i)].as_ref().map(|x| x.area);
     let mut last = None;
-    for i in (0..n).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
+    // sections that are missing behind all others are open at a cap, not leaking at the junction
+    let Some(outermost) = (0..n).rev().find(|&i| area(sections, i).is_some()) else { return };
+    for i in (0..outermost).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
         let Some(a) = area(sections, i) else {
             last = Some(i);
             continue;

@@ -230,8 +230,8 @@ pub(crate) fn drawn_anastomosis(seed: u64) -> Star {
     };
     let directions =
         [direction(0.0, 0.0, 1.0), direction(bend[0], bend[1], -1.0), direction(angle.sin(), 0.0, angle.cos())];
-    // the caps of host and graft lie in one plane, a radius apart
-    let apart = graft / angle.cos() + 2.0 * host;
+    // the caps of host and graft lie in one plane, two radii apart
+    let apart = graft / angle.cos() + 3.0 * host;
     let half = (apart / angle.tan()).max(4.0 * host);
     let centre = P3::new(draw.between(-1.0, 1.0), draw.between(-1.0, 1.0), draw.between(-1.0, 1.0));
     let radii = [host, host, graft];
