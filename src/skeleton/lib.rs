@@ -5,6 +5,7 @@
 mod bits;
 mod caps;
 mod check;
+mod cluster;
 mod error;
 mod graph;
 mod lumen;

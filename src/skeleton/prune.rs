@@ -5,6 +5,7 @@
 //! sphere does not already fill. Such branches are dropped, the smallest first, and what becomes a passage is joined,
 //! until none is left. Loops stay. A tip that meets a cap of the surface stays whatever its length, one for each cap.
 
+use crate::cluster::merge_clusters;
 use crate::graph::{merge_passages, without_nodes};
 use crate::lumen::Hit;
 use crate::pinholes;
@@ -44,7 +45,8 @@ pub struct PruneReport {
 }
 
 /// Drop spurs from `graph`, one after the other, each time the one that is smallest against the inscribed radius at its
-/// junction; loops around pinholes lose their thinner side, each with the warning `skeleton.pinhole`. Pieces whose line is shorter than two radii (a blob, a lone voxel) are dropped too, each with the warning
+/// junction; loops around pinholes lose their thinner side, each with the warning `skeleton.pinhole`; junctions
+/// within each other's spheres become one. Pieces whose line is shorter than two radii (a blob, a lone voxel) are dropped too, each with the warning
 /// `skeleton.compact_piece`. Inscribed radii are measured at the nodes.
 ///
 /// # Errors
@@ -74,7 +76,7 @@ pub fn prune(
             break;
         }
     }
-    let graph = without_compact_pieces(graph, lumen, &caps, &mut report);
+    let graph = merge_clusters(without_compact_pieces(graph, lumen, &caps, &mut report));
     if graph.edges.is_empty() {
         return Err(Error::NoLine);
     }

@@ -31,7 +31,7 @@ const AXIS_RADII: f64 = 3.0;
 /// [`PROXIMAL_STEPS`] times, it acts only along directions in which the lines say nothing.
 const PROXIMAL_WEIGHT: f64 = 0.02;
 const PROXIMAL_STEPS: usize = 20;
-/// How far a junction may move to the crossing of the axes, in its inscribed radii: thinning puts it towards the crotch,
+/// How far a junction may move to the crossing of the axes, in the largest radius of its branches: thinning puts it towards the crotch,
 /// 1.3 radii from the crossing for a graft at 45 degrees, 4.3 for one at 20 (the crotch itself lies 1 / tan 10 = 5.7 out).
 const JUNCTION_REACH_RADII: f64 = 6.0;
 
@@ -167,7 +167,7 @@ fn take_sections(
     }
     let s = abscissae(&line.points);
     for (end, node) in ends.iter().enumerate().filter(|(_, node)| node.kind == NodeKind::Junction) {
-        drop_swelling(&mut line.sections, &s, end, node.radius_mm);
+        drop_swelling(&mut line.sections, &s, end, node.radius_mm.max(line.radius));
     }
     Ok(())
 }
@@ -222,7 +222,9 @@ fn place_nodes(graph: &mut MedialGraph, lines: &[Line], lumen: &Lumen<'_>) {
             continue;
         }
         let crossing = nearest_to_lines(&axes, node.position);
-        let near = crossing.distance(node.position) <= JUNCTION_REACH_RADII * node.radius_mm;
+        // a junction that thinning put into the crotch has a small sphere
+        let radius = at.iter().map(|&(e, _)| lines[e].radius).fold(node.radius_mm, f64::max);
+        let near = crossing.distance(node.position) <= JUNCTION_REACH_RADII * radius;
         if near && lumen.contains(crossing) && lumen.sees(node.position, crossing) {
             node.position = crossing;
         }
