@@ -9,7 +9,8 @@
 //! match when its neighbourhood changed, so a queue per direction holds the words next to a deletion since they were
 //! last tested: one byte per word of the volume and 4 per queued word, 2 MiB and some 3 MiB at 512^3 for a vessel that
 //! fills 1 %. Rejected: a bit per voxel and direction of what must be tested again, with the voxels tested one by one
-//! (2.9 times as long at 512^3, 56 bytes per word), and a list of border voxels (8 bytes each).
+//! (some twice as long at 512^3, 56 bytes per word), four words at a time in SIMD lanes on a copy with a margin (as fast, 36
+//! instead of 5 MiB), and a list of border voxels (8 bytes each).
 
 use crate::masks::{Direction, matches};
 use crate::{BitVolume, Error};

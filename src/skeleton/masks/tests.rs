@@ -228,7 +228,7 @@ fn the_algebra_on_words_is_the_masks_on_all_2_to_26_neighbourhoods() {
     let ctx = Ctx::new(0).unwrap();
     let differing = ctx
         .map_range(1 << 10, |block| {
-            let code = |high: u32, b: u32| neighbourhood((block as u32) << 16 | high << 6 | b);
+            let code = |high: u32, b: u32| neighbourhood(((block as u32) << 16) | (high << 6) | b);
             (0..1 << 10)
                 .filter(|&high| {
                     let expected = (0..64).fold(0, |m, b| m | u64::from(deletable(&set, code(high, b))) << b);
@@ -247,7 +247,7 @@ fn the_algebra_of_every_direction_is_its_masks() {
         let words: [u64; 27] = std::array::from_fn(|_| {
             let mut next = || {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-                state ^ state >> 29
+                state ^ (state >> 29)
             };
             let (a, b) = (next(), next());
             if next() & 1 == 0 { a & b } else { a }

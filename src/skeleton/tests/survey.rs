@@ -55,8 +55,8 @@ fn survey(seeds: std::ops::Range<u64>, sizes: &[usize]) {
 #[test]
 fn a_rim_spur_in_the_wedge_of_an_oblique_cap_is_no_fourth_end() {
     // these draws grow spurs into the wedge between the graft and its cap
-    for seed in [27, 59] {
-        graph_of(seed, 128, NOISE_VOXELS).unwrap();
+    for (seed, across, noise) in [(27, 128, NOISE_VOXELS), (59, 128, NOISE_VOXELS), (37, 256, 0.0), (83, 256, 0.0)] {
+        graph_of(seed, across, noise).unwrap();
     }
 }
 
