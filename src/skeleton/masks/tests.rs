@@ -262,7 +262,7 @@ fn the_algebra_of_every_direction_is_its_masks() {
         ];
         for (d, found) in Direction::ALL.into_iter().zip(found) {
             let set = masks(d);
-            let n = |b: u32| (0..27).fold(0, |n, v| n | (words[v as usize] >> b & 1) as u32 * (1 << v));
+            let n = |b: u32| (0..27).fold(0, |n, v| n | (((words[v as usize] >> b & 1) as u32) << v));
             let expected = (0..64).fold(0, |m, b| m | u64::from(n(b) & CENTRE != 0 && deletable(&set, n(b))) << b);
             assert_eq!(found, expected, "{d:?}");
         }
