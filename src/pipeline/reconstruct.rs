@@ -70,7 +70,7 @@ fn reconstruct(
     let warnings: Vec<Warning> =
         [input.warnings.clone(), segmentation.warnings.clone(), medial.warnings].into_iter().flatten().collect();
     let mut files = steps.step("write", |_| {
-        write::write_all(&Reconstruction {
+        let reconstruction = Reconstruction {
             input: facts::input(&input),
             segmentation: facts::segmentation(&contours, &segmentation),
             contours: &contours,
@@ -80,7 +80,10 @@ fn reconstruct(
             morphometry: &morphometry,
             warnings: &warnings,
             pictures: write::slice_pictures(&stack, &contours)?,
-        })
+        };
+        let mut files = write::write_all(&reconstruction)?;
+        files.extend(write::write_asked(&reconstruction, &plan.outputs)?);
+        Ok::<_, write::Error>(files)
     })?;
     let result = files
         .first()

@@ -30,6 +30,9 @@ const WEDGE_RADII: f64 = 0.35;
 /// A leaf branch whose tip's sphere reaches less far beyond its parent's spheres is a spur, voxels: half a radius of the
 /// smallest vessel at the automatic spacing.
 const PROTRUSION_VOXELS: f64 = 2.0;
+/// And by this share of its parent's radius: at 512^3 (30 voxels per radius) spurs of noise reach farther than 2 voxels,
+/// and a vessel that shows less than this outside its parent has no line to measure.
+const PROTRUSION_RADII: f64 = 0.2;
 /// Rays over a cap, and their reach in inscribed radii: what is farther than an oblique section of 70 degrees belongs to
 /// a neighbour.
 const CAP_RAYS: usize = 32;
@@ -112,12 +115,15 @@ fn smallest_spur(graph: &MedialGraph, lumen: &Lumen<'_>, caps: &Caps, settings: 
     (0..graph.edges.len()).filter_map(size).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, e)| e)
 }
 
-/// How far the inscribed sphere at a leaf branch's tip reaches beyond those of the lines that the branch leaves, mm: the
-/// length of a vessel outside its parent. In a merged lumen, which is wider than its spheres, a spur may be longer than
+/// How far the inscribed sphere at a leaf branch's tip reaches beyond those of the lines that the branch leaves (each a
+/// fifth larger), mm: the length of a vessel outside its parent. In a merged lumen, which is wider than its spheres, a spur may be longer than
 /// their radius and still reach nowhere.
 fn protrusion(graph: &MedialGraph, leaf: usize, tip: usize, lumen: &Lumen<'_>) -> f64 {
     let tip = &graph.nodes[tip];
-    let beyond = |p: P3| p.distance(tip.position) + tip.radius_mm - lumen.inscribed(p).unwrap_or(0.0);
+    let beyond = |p: P3| {
+        let radius = lumen.inscribed(p).unwrap_or(0.0);
+        p.distance(tip.position) + tip.radius_mm - (1.0 + PROTRUSION_RADII) * radius
+    };
     let nodes = graph.edges[leaf].nodes;
     let beside = |e: &usize| *e != leaf && graph.edges[*e].nodes.iter().any(|n| nodes.contains(n));
     let reach = 2.0 * graph.edges[leaf].length_mm();

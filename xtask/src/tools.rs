@@ -11,6 +11,7 @@ use std::path::PathBuf;
 const PYTHON_PACKAGES: &[&str] = &[
     "numpy",
     "vtk==9.5.2",
+    "networkx==3.6.1",
     "pydicom==3.0.2",
     "nibabel==5.4.2",
     "SimpleITK==2.5.7",
