@@ -400,6 +400,15 @@ mod tests {
     }
 
     #[test]
+    fn the_information_criterion_tells_a_helix_from_an_arc() {
+        use crate::types::CurveKind;
+        let kind = |k: f64, t: f64, noise: f64| fit_helix(&helix(k, t, 60.0, noise)).unwrap().enough;
+        assert_eq!(kind(0.049, 0.033, 0.02), CurveKind::Helix);
+        assert_eq!(kind(0.03, 0.0, 0.02), CurveKind::Arc);
+        assert_eq!(kind(0.03, 0.0, 0.0), CurveKind::Arc);
+    }
+
+    #[test]
     fn a_few_points_that_were_pulled_off_do_not_count() {
         let mut points = helix(0.049, 0.033, 80.0, 0.01);
         for i in [20, 21, 22, 90] {
