@@ -9,6 +9,7 @@
 //! restricted likelihood of clusters of neighbouring constraints. Nothing is tuned by hand.
 
 use crate::constraints::{self, Constraints};
+use crate::ensemble::Ensemble;
 use crate::kernel::Centres;
 use crate::system::{Factor, Scale, residual};
 use crate::{Error, Field, Settings};
@@ -76,12 +77,26 @@ const RESIDUAL_PX: f64 = 3.0;
 /// [`Error::TooFewPoints`], [`Error::Coplanar`], [`Error::TooMany`], [`Error::Singular`], [`Error::Residual`],
 /// [`Error::Cancelled`].
 pub fn fit(contours: &Contours, settings: &Settings, ctx: &Ctx) -> Result<(Variational, FitReport), Error> {
+    let (f, report, _) = fit_with_ensemble(contours, settings, 0, ctx)?;
+    Ok((f, report))
+}
+
+/// [`fit`] with `draws` functions that the data allow as well, for error bands. Each costs one more solve with the factor.
+///
+/// # Errors
+/// As [`fit`].
+pub fn fit_with_ensemble(
+    contours: &Contours,
+    settings: &Settings,
+    draws: usize,
+    ctx: &Ctx,
+) -> Result<(Variational, FitReport, Ensemble), Error> {
     let planar = constraints::planar(contours, settings);
     guard(&planar, settings)?;
-    let (first, _) = solve(&planar, contours, &ctx.part(0.0, 0.5))?;
+    let (first, ..) = solve(&planar, contours, 0, &ctx.part(0.0, 0.5))?;
     let normal = |x: P3| first.gradient(x).1.normalised();
     let spatial = constraints::spatial(&planar, normal, |x| first.value(x) > 0.0);
-    solve(&spatial, contours, &ctx.part(0.5, 1.0))
+    solve(&spatial, contours, draws, &ctx.part(0.5, 1.0))
 }
 
 fn guard(c: &Constraints, settings: &Settings) -> Result<(), Error> {
@@ -95,7 +110,12 @@ fn guard(c: &Constraints, settings: &Settings) -> Result<(), Error> {
     Ok(())
 }
 
-fn solve(c: &Constraints, contours: &Contours, ctx: &Ctx) -> Result<(Variational, FitReport), Error> {
+fn solve(
+    c: &Constraints,
+    contours: &Contours,
+    draws: usize,
+    ctx: &Ctx,
+) -> Result<(Variational, FitReport, Ensemble), Error> {
     let scale = Scale::of(&c.points);
     let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
     let s = roughness(c, &points, ctx)?;
@@ -110,6 +130,7 @@ fn solve(c: &Constraints, contours: &Contours, ctx: &Ctx) -> Result<(Variational
     coefficients.iter_mut().zip(&dc).for_each(|(c, d)| *c += d);
     polynomial.iter_mut().zip(&db).for_each(|(b, d)| *b += d);
     let r = residual(&points, &noise, &c.values, (&coefficients, &polynomial), ctx)?;
+    let ensemble = Ensemble::new(c, &factor, (scale, s), draws, ctx)?;
     ctx.progress(1.0);
     let report = report(c, &noise, &coefficients, (&points, &r, factor.condition()));
     accept(c, &noise, &coefficients, contours)?;
@@ -117,7 +138,7 @@ fn solve(c: &Constraints, contours: &Contours, ctx: &Ctx) -> Result<(Variational
     let centres = Centres::new(&points, &coefficients);
     let inner = (0..c.interior.len()).map(|k| c.points[c.wall + k]).collect();
     let wall = c.points[..c.wall].to_vec();
-    Ok((Variational { centres, polynomial, scale, bounds: bounds.grown(2.0), wall, inner }, report))
+    Ok((Variational { centres, polynomial, scale, bounds: bounds.grown(2.0), wall, inner }, report, ensemble))
 }
 
 fn report(

@@ -5,6 +5,7 @@
 //! ```
 
 mod constraints;
+mod ensemble;
 mod error;
 mod field;
 mod fit;
@@ -17,9 +18,10 @@ mod system;
 mod test_fields;
 
 pub use constraints::Constraints;
+pub use ensemble::{Draws, Ensemble};
 pub use error::Error;
 pub use field::{Field, foot};
-pub use fit::{FitReport, Variational, fit};
+pub use fit::{FitReport, Variational, fit, fit_with_ensemble};
 pub use sampled::{Sampled, SampledSettings};
 pub use settings::Settings;
 pub use smooth::{SmoothReport, Smoothing, smooth};

@@ -10,7 +10,7 @@
 use crate::linear::{median, positive, solve};
 use space::{DMat3, DVec3, P3};
 
-use crate::types::Helix;
+use crate::types::{CurveKind, Helix};
 
 /// A branch that bends by less than this in all, radians, is as good as straight: its plane of bending, and with it
 /// the torsion, is not told by points with an error of a hundredth of the radius.
@@ -140,6 +140,29 @@ impl State {
 /// bends by less than .35 rad in all, is not 3 times nearer to the helix than to a straight line, or leaves the torsion uncertain by more
 /// than a fifth of sqrt(k^2 + t^2). Cost: some tens of passes, each 15 curve points per sample.
 pub fn fit_helix(points: &[P3]) -> Option<Helix> {
+    fitted(points).map(|f| f.helix)
+}
+
+/// A helix with the curve behind it, from which a line that differs by a little is fitted in a few turns.
+#[derive(Clone, Debug)]
+pub(crate) struct FittedHelix {
+    pub(crate) helix: Helix,
+    curve: Curve,
+    foot: Vec<f64>,
+}
+
+impl FittedHelix {
+    /// Curvature and torsion of the helix nearest to other points of the same branch, as many as were fitted.
+    pub(crate) fn refitted(&self, points: &[P3]) -> [f64; 2] {
+        let points: Vec<DVec3> = points.iter().map(|p| p.raw()).collect();
+        let length = self.foot[self.foot.len() - 1] - self.foot[0];
+        let (state, _) = descend(State::new(self.curve, &points, &self.foot), &points, length.abs());
+        [state.curve.curvature.abs(), state.curve.torsion]
+    }
+}
+
+/// See [`fit_helix`].
+pub(crate) fn fitted(points: &[P3]) -> Option<FittedHelix> {
     if points.len() < POINTS_MIN {
         return None;
     }
@@ -161,7 +184,8 @@ pub fn fit_helix(points: &[P3]) -> Option<Helix> {
         }
     }
     let (_, state, weight) = best?;
-    report(&state, &weight, &points, length)
+    let helix = report(&state, &weight, &points, length)?;
+    Some(FittedHelix { helix, curve: state.curve, foot: state.foot })
 }
 
 /// Natural units of the seven parameters for a line of some length, which make the normal matrix well scaled.
@@ -270,7 +294,63 @@ fn report(state: &State, weight: &[f64], points: &[DVec3], length: f64) -> Optio
         curvature_per_mm: k,
         torsion_per_mm: t,
         rms_mm: rms,
+        enough: simplest(state, weight, points, length),
+        curvature_band95: None,
+        torsion_band95: None,
     })
+}
+
+/// Samples along a medial line that count as one observation: neighbouring sections share their contours, a diameter of
+/// 16 sections a few of them.
+const SHARED_SAMPLES: f64 = 8.0;
+
+/// The curve of least n log(rms^2) + k log n (Schwarz 1978), with n the independent samples, of a line (4 parameters), an
+/// arc (6) and a helix (7).
+fn simplest(state: &State, weight: &[f64], points: &[DVec3], length: f64) -> CurveKind {
+    let total: f64 = weight.iter().sum();
+    let n = (points.len() as f64 / SHARED_SAMPLES).max(2.0);
+    let flat = State::new(Curve { torsion: 0.0, ..state.curve }, points, &state.foot);
+    let arc = descend_arc(flat, points, weight, length);
+    let square = [
+        (CurveKind::Line, straight_rms(points, weight).powi(2), 4.0),
+        (CurveKind::Arc, arc.cost(weight) / total, 6.0),
+        (CurveKind::Helix, state.cost(weight) / total, 7.0),
+    ];
+    // exact curves differ by rounding alone
+    let floor = (1e-7 * length).powi(2);
+    let score = |(_, square, parameters): &(CurveKind, f64, f64)| n * square.max(floor).ln() + parameters * n.ln();
+    square.iter().min_by(|a, b| score(a).total_cmp(&score(b))).map_or(CurveKind::Helix, |s| s.0)
+}
+
+/// The nearest arc: the torsion stays 0, the weights as they are.
+fn descend_arc(mut state: State, points: &[DVec3], weight: &[f64], length: f64) -> State {
+    const TURNS: usize = 40;
+    let unit = units(length);
+    let mut damping = 1e-3;
+    for _ in 0..TURNS {
+        let (mut a, mut b) = state.normal(weight, &unit);
+        for (i, row) in a.iter_mut().enumerate() {
+            row[i] += damping * row[i] + 1e-15 * length * length;
+            row[FREE - 1] = 0.0;
+        }
+        a[FREE - 1] = [0.0; FREE];
+        (a[FREE - 1][FREE - 1], b[FREE - 1]) = (1.0, 0.0);
+        let Some(step) = solve(a, b) else { break };
+        let next = State::new(state.curve.moved(&std::array::from_fn(|i| step[i] * unit[i])), points, &state.foot);
+        if next.cost(weight) > state.cost(weight) {
+            damping *= 10.0;
+            if damping > 1e9 {
+                break;
+            }
+            continue;
+        }
+        state = next;
+        damping = (damping * 0.1).max(1e-12);
+        if step.iter().all(|x| x.abs() < 1e-12) {
+            break;
+        }
+    }
+    state
 }
 
 #[cfg(test)]
@@ -317,6 +397,15 @@ mod tests {
         assert!(
             (h.pitch_mm / (std::f64::consts::TAU * 0.033 / (0.049f64.powi(2) + 0.033f64.powi(2))) - 1.0).abs() < 4e-3
         );
+    }
+
+    #[test]
+    fn the_information_criterion_tells_a_helix_from_an_arc() {
+        use crate::types::CurveKind;
+        let kind = |k: f64, t: f64, noise: f64| fit_helix(&helix(k, t, 60.0, noise)).unwrap().enough;
+        assert_eq!(kind(0.049, 0.033, 0.02), CurveKind::Helix);
+        assert_eq!(kind(0.03, 0.0, 0.02), CurveKind::Arc);
+        assert_eq!(kind(0.03, 0.0, 0.0), CurveKind::Arc);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! [`measure`] is the whole; its stages are public for tests and studies.
 
 mod angle;
+mod bands;
 mod error;
 mod fit;
 mod helix;
@@ -20,6 +21,9 @@ pub use error::Error;
 pub use fit::{FittedLine, fit_line, meeting_point};
 pub use helix::fit_helix;
 pub use junction::crotch_distance;
-pub use measure::measure;
+pub use measure::{measure, measure_with_bands};
 pub use section::{Cut, Lumen, Outline, RAYS};
-pub use types::{Angle, Branch, ByDistance, Helix, Junction, Morphometry, Role, Roles, Section, Settings, VmtkAngles};
+pub use types::{
+    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Roles, Section, Settings, Stenosis,
+    VmtkAngles,
+};

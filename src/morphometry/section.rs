@@ -8,10 +8,10 @@
 //!
 //! Limits: a section that is not star-shaped about its centre is cut short by its nearer wall.
 
-use crate::linear::positive;
+use crate::linear::{eigen3, outer, positive};
 use imaging::CutPlane;
 use implicit::Field;
-use space::{DVec3, P3, V3};
+use space::{DMat3, DVec3, P3, V3};
 
 /// Rays of a reported section. 48 already meet an ellipse of ratio 3 to 1e-6; 96 leave room for lobed sections.
 pub const RAYS: usize = 96;
@@ -31,6 +31,8 @@ pub struct Outline {
     pub perimeter_mm: f64,
     /// Area centroid.
     pub centroid: P3,
+    /// Ratio of the axes of the ellipse with the same second moments of area, shorter over longer: 1 for a circle.
+    pub shape: f64,
     /// Longest and shortest ray, mm.
     pub longest_mm: f64,
     /// See `longest_mm`.
@@ -73,12 +75,23 @@ impl Lumen<'_> {
     ///
     /// Cost: about 8 evaluations of f for each ray.
     pub fn section(&self, centre: P3, tangent: V3, radius_mm: f64, rays: usize) -> Cut {
+        match self.rays(centre, tangent, radius_mm, rays) {
+            Ok(wall) => closed(centre.raw(), &wall),
+            Err(cut) => cut,
+        }
+    }
+
+    /// The rays of a section, at even angles.
+    ///
+    /// # Errors
+    /// The cut that it is instead of a closed one.
+    pub(crate) fn rays(&self, centre: P3, tangent: V3, radius_mm: f64, rays: usize) -> Result<Vec<Ray>, Cut> {
         let f = self.field.value(centre);
         if self.exit(centre.raw(), DVec3::ZERO) <= 0.0 {
-            return Cut::Open;
+            return Err(Cut::Open);
         }
         if !positive(f) || !positive(radius_mm) {
-            return Cut::Outside;
+            return Err(Cut::Outside);
         }
         let (u, v) = frame(tangent.raw());
         let mut wall = Vec::with_capacity(rays);
@@ -87,13 +100,14 @@ impl Lumen<'_> {
             let (along, around) = (u * cos + v * sin, v * cos - u * sin);
             match self.wall(centre.raw(), along, f, radius_mm) {
                 Hit::Wall { r, gradient } => {
-                    wall.push((r, along, -r * gradient.dot(around) / gradient.dot(along)));
+                    let fall = gradient.dot(along);
+                    wall.push(Ray { r, along, slope: -r * gradient.dot(around) / fall, fall });
                 }
-                Hit::Open => return Cut::Open,
-                Hit::Far => return Cut::Leaking,
+                Hit::Open => return Err(Cut::Open),
+                Hit::Far => return Err(Cut::Leaking),
             }
         }
-        closed(centre.raw(), &wall)
+        Ok(wall)
     }
 
     /// Distance from `centre` to the wall: the radius of the largest sphere about it that stays in the lumen, found by
@@ -190,27 +204,54 @@ fn frame(t: DVec3) -> (DVec3, DVec3) {
     (u, t.cross(u))
 }
 
-/// Sums over the wall points (r, direction, dr/dphi) around a centre.
-fn closed(centre: DVec3, wall: &[(f64, DVec3, f64)]) -> Cut {
+/// A ray from a section's centre to the wall.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Ray {
+    /// Its length, mm.
+    pub(crate) r: f64,
+    /// Its unit direction.
+    pub(crate) along: DVec3,
+    /// dr/dphi, mm.
+    pub(crate) slope: f64,
+    /// df/dr at the wall (negative).
+    pub(crate) fall: f64,
+}
+
+/// Area and centroid (from the centre) of an outline of rays at even angles.
+pub(crate) fn area_and_shift(rays: impl ExactSizeIterator<Item = (f64, DVec3)>) -> (f64, DVec3) {
+    let step = std::f64::consts::TAU / rays.len() as f64;
+    let sums = rays.fold((0.0, DVec3::ZERO), |(area, moment), (r, along)| {
+        (area + 0.5 * r * r * step, moment + along * (r * r * r / 3.0 * step))
+    });
+    (sums.0, sums.1 / sums.0)
+}
+
+/// Sums over the rays around a centre.
+fn closed(centre: DVec3, wall: &[Ray]) -> Cut {
     let step = std::f64::consts::TAU / wall.len() as f64;
-    let (mut area, mut perimeter, mut moment) = (0.0, 0.0, DVec3::ZERO);
+    let (area, shift) = area_and_shift(wall.iter().map(|w| (w.r, w.along)));
+    let mut perimeter = 0.0;
     let (mut longest, mut shortest) = (0.0f64, (f64::INFINITY, DVec3::X));
-    for &(r, along, slope) in wall {
-        area += 0.5 * r * r * step;
-        perimeter += r.hypot(slope) * step;
-        moment += along * (r * r * r / 3.0 * step);
-        longest = longest.max(r);
-        if r < shortest.0 {
-            shortest = (r, along);
+    // second moments about the centre: int r^4 / 4 (direction direction^T)
+    let mut spread = DMat3::ZERO;
+    for ray in wall {
+        perimeter += ray.r.hypot(ray.slope) * step;
+        spread += outer(ray.along, 0.25 * ray.r.powi(4) * step);
+        longest = longest.max(ray.r);
+        if ray.r < shortest.0 {
+            shortest = (ray.r, ray.along);
         }
     }
+    spread -= outer(shift, area);
+    let [_, (minor, _), (major, _)] = eigen3(spread);
     if !(area.is_finite() && perimeter.is_finite() && area > 0.0) {
         return Cut::Leaking;
     }
     Cut::Closed(Outline {
         area_mm2: area,
         perimeter_mm: perimeter,
-        centroid: P3::from_raw(centre + moment / area),
+        centroid: P3::from_raw(centre + shift),
+        shape: (minor / major).max(0.0).sqrt(),
         longest_mm: longest,
         shortest_mm: shortest.0,
         shortest: V3::from_raw(shortest.1),

@@ -76,6 +76,11 @@ impl Track {
         median(usable.filter_map(|k| self.sections[k].radius_area_mm()).collect())
     }
 
+    /// Centres of the usable sections, in order.
+    pub(crate) fn centred(&self) -> Vec<P3> {
+        (0..self.sections.len()).filter(|&k| self.usable(k)).map(|k| self.sections[k].position).collect()
+    }
+
     /// Forget all junction flags but those of the sections' own shape.
     pub(crate) fn reset_junction(&mut self) {
         for (s, &leak) in self.sections.iter_mut().zip(&self.leak) {
@@ -112,7 +117,7 @@ impl Track {
         }
     }
 
-    fn bend(&mut self) {
+    pub(crate) fn bend(&mut self) {
         let (s, points, weight) = (self.abscissas(), self.positions(), self.weights());
         let line = Samples { s: &s, points: &points, weight: &weight };
         let half = (CURVATURE_RADII * self.radius()).max(8.0 * self.length() / (s.len() - 1) as f64);
@@ -125,12 +130,13 @@ impl Track {
     fn take(&mut self, k: usize, cut: Cut, inscribed: Option<f64>, centre: Centre) {
         let medial = P3::from_raw(self.medial[k]);
         let section = &mut self.sections[k];
-        (section.area_mm2, section.perimeter_mm) = (None, None);
+        (section.area_mm2, section.perimeter_mm, section.shape) = (None, None, None);
         (section.open, self.leak[k], self.ratio[k]) = (false, false, None);
         match cut {
             Cut::Closed(o) => {
                 section.area_mm2 = Some(o.area_mm2);
                 section.perimeter_mm = Some(o.perimeter_mm);
+                section.shape = Some(o.shape);
                 self.ratio[k] = section.radius_area_mm().map(|r| o.longest_mm / r);
                 let shifted = o.centroid.distance(medial) > SHIFT_RADII * section.radius_inscribed_mm;
                 self.leak[k] = shifted;
@@ -331,6 +337,9 @@ fn smoothed(id: usize, nodes: [usize; 2], tip: [bool; 2], at: &[f64], sampled: &
             area_mm2: None,
             perimeter_mm: None,
             curvature_per_mm: None,
+            shape: None,
+            area_error_mm2: None,
+            curvature_error_per_mm: None,
             in_junction: false,
             open: false,
         });

@@ -80,6 +80,12 @@ pub struct Section {
     pub perimeter_mm: Option<f64>,
     /// Curvature of the medial line, 1/mm.
     pub curvature_per_mm: Option<f64>,
+    /// Ratio of the axes of the ellipse with the same second moments of area, shorter over longer.
+    pub shape: Option<f64>,
+    /// Standard error of the area from the data's noise and spacing, mm2.
+    pub area_error_mm2: Option<f64>,
+    /// Standard error of the curvature, 1/mm.
+    pub curvature_error_per_mm: Option<f64>,
     /// The lumens of several branches overlap here.
     pub in_junction: bool,
     /// The section is not closed within the data (near an end).
@@ -97,6 +103,28 @@ impl Section {
     }
 }
 
+/// Which of the curves of constant curvature and torsion is enough for a line, by the Bayesian information criterion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CurveKind {
+    /// Straight.
+    Line,
+    /// A circle's arc: no torsion.
+    Arc,
+    /// Curvature and torsion.
+    Helix,
+}
+
+impl CurveKind {
+    /// The name in result.json.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Line => "line",
+            Self::Arc => "arc",
+            Self::Helix => "helix",
+        }
+    }
+}
+
 /// A helix fitted to the medial line of one branch outside the junction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Helix {
@@ -110,6 +138,22 @@ pub struct Helix {
     pub torsion_per_mm: f64,
     /// Distance of the medial line from the helix, mm.
     pub rms_mm: f64,
+    /// The simplest curve that describes the line as well: see [`CurveKind`].
+    pub enough: CurveKind,
+    /// 95 % band of the curvature, 1/mm.
+    pub curvature_band95: Option<[f64; 2]>,
+    /// 95 % band of the torsion, 1/mm.
+    pub torsion_band95: Option<[f64; 2]>,
+}
+
+/// Where a branch is narrowest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stenosis {
+    /// Smallest area over the area expected there from the rest of the branch (a line through the medians of its two
+    /// halves): 1 where nothing narrows.
+    pub area_ratio: f64,
+    /// Arc length from the branch's first node, mm.
+    pub abscissa_mm: f64,
 }
 
 /// A branch of the medial graph with its measures.
@@ -131,6 +175,10 @@ pub struct Branch {
     pub direction: Option<V3>,
     /// Median area-equivalent diameter outside the junction, mm.
     pub diameter_mm: Option<f64>,
+    /// 95 % band of the diameter, mm.
+    pub diameter_band95_mm: Option<[f64; 2]>,
+    /// The narrowest section outside the junction.
+    pub stenosis: Option<Stenosis>,
     /// Cross-sections, ascending abscissa.
     pub sections: Vec<Section>,
     /// Helix fit, where the branch is long enough to tell.
@@ -144,6 +192,9 @@ pub struct ByDistance {
     pub diameters: Vec<f64>,
     /// The angle there, degrees.
     pub value_deg: Vec<Option<f64>>,
+    /// Largest root mean square distance of a leg's line from its samples, mm: grows with the distance where a vessel
+    /// is bent and not where it is straight.
+    pub residual_mm: Vec<Option<f64>>,
 }
 
 /// One angle of a junction.

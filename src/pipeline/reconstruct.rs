@@ -9,7 +9,7 @@ use artefact::write::{self, NamedBytes, Provenance};
 use artefact::{Reconstruction, reconstruction::SurfaceData};
 use exec::Ctx;
 use imaging::{Contours, Stack};
-use implicit::{Field, Sampled, Smoothing, Variational};
+use implicit::{Draws, Field, Sampled, Smoothing, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
@@ -18,6 +18,9 @@ use std::path::{Path, PathBuf};
 use surface::{
     Bounded, Displacement, Extension, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh,
 };
+
+/// Draws from the fit's posterior for the 95 % bands: their standard deviation is known to 1 / sqrt(2 * 24) = 14 %.
+const DRAWS: usize = 24;
 
 /// The surface with all that is known of it.
 pub(crate) struct Wall {
@@ -61,18 +64,21 @@ fn reconstruct(
 
     let (stack, input) = steps.step("read", |_| artefact::read::stack(inputs, plan, &Limits::default()))?;
     let (contours, segmentation) = steps.step("contours", |ctx| imaging::contours(&stack, &plan.imaging(), ctx))?;
-    let (f, fit) = steps.step("fit", |ctx| implicit::fit(&contours, &implicit::Settings::default(), ctx))?;
+    let (f, fit, ensemble) =
+        steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &implicit::Settings::default(), DRAWS, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
     let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
     let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
     let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
-    let morphometry = steps
-        .step("measure", |ctx| morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx))?;
+    let morphometry = steps.step("measure", |ctx| {
+        let (draws, settings): (Option<&dyn Draws>, _) = (Some(&ensemble), plan.morphometry());
+        morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &settings, ctx)
+    })?;
 
     let warnings: Vec<Warning> =
         [input.warnings.clone(), segmentation.warnings.clone(), wall.warnings.clone(), medial.warnings].concat();
     let mut files = steps.step("write", |_| {
-        write::write_all(&Reconstruction {
+        let reconstruction = Reconstruction {
             input: facts::input(&input),
             segmentation: facts::segmentation(&contours, &segmentation),
             contours: &contours,
@@ -82,7 +88,10 @@ fn reconstruct(
             morphometry: &morphometry,
             warnings: &warnings,
             pictures: write::slice_pictures(&stack, &contours)?,
-        })
+        };
+        let mut files = write::write_all(&reconstruction)?;
+        files.extend(write::write_asked(&reconstruction, &plan.outputs)?);
+        Ok::<_, write::Error>(files)
     })?;
     files.extend(variants(&wall).map_err(|e| Failure::of(&e))?);
     let result = files

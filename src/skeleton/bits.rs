@@ -64,7 +64,8 @@ impl BitVolume {
     }
     /// Number of object voxels.
     pub fn count(&self) -> usize {
-        self.words.iter().map(|w| w.count_ones() as usize).sum()
+        // most words are empty, and counting bits takes ten times as long as seeing that
+        self.words.iter().filter(|w| **w != 0).map(|w| w.count_ones() as usize).sum()
     }
     /// The object voxels, x fastest, then y, then z.
     pub fn voxels(&self) -> impl Iterator<Item = [usize; 3]> + '_ {

@@ -10,7 +10,7 @@ use space::{Grid, P3};
 type Voxel = [usize; 3];
 
 /// The medial graph of a thinned volume (see [`crate::thin`]). Points are voxel centres, a junction lies at the
-/// centroid of its voxels; nodes and edges are numbered in the order of their first voxel (x fastest). Radii are not
+/// voxel of its own that is nearest to their centroid; nodes and edges are numbered in the order of their first voxel (x fastest). Radii are not
 /// measured yet: they are 0. A component of one voxel becomes an end without edges. A junction of which only two edges
 /// are left (a voxel more than a line needs) is merged into one edge.
 ///
@@ -32,7 +32,14 @@ pub fn graph(volume: &BitVolume, grid: &Grid) -> MedialGraph {
             closed_line(&tracer, base, &mut traced, &mut graph, grid);
         }
     }
-    merge_passages(graph)
+    let mut graph = merge_passages(graph);
+    // a clump at the end of a line
+    for n in 0..graph.nodes.len() {
+        if graph.degree(n) == 1 {
+            graph.nodes[n].kind = NodeKind::End;
+        }
+    }
+    graph
 }
 
 /// A closed line without a junction: its base node is its first voxel. Three voxels that all touch enclose nothing:
@@ -140,7 +147,7 @@ impl Tracer {
             .map(|m| {
                 let points: Vec<P3> = m.iter().map(|&v| self.position(v, grid)).collect();
                 let kind = if m.iter().any(|&v| self.near[v].len() > 2) { NodeKind::Junction } else { NodeKind::End };
-                Node { kind, position: P3::centroid(&points).unwrap_or_default(), radius_mm: 0.0, cap: None }
+                Node { kind, position: middle(&points), radius_mm: 0.0, cap: None }
             })
             .collect()
     }
@@ -180,6 +187,13 @@ impl Tracer {
         points.dedup_by(|a, b| a.distance(*b) < 1e-9);
         Edge { nodes: [from, to], radius_mm: vec![0.0; points.len()], points }
     }
+}
+
+/// The point nearest to the centroid of all: the centroid itself may lie in a hole between them.
+fn middle(points: &[P3]) -> P3 {
+    let centroid = P3::centroid(points).unwrap_or_default();
+    let nearest = points.iter().min_by(|a, b| a.distance(centroid).total_cmp(&b.distance(centroid)));
+    nearest.copied().unwrap_or_default()
 }
 
 /// The graph with every junction of degree two merged into one edge (bases of closed lines excepted).

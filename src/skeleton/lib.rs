@@ -5,11 +5,13 @@
 mod bits;
 mod caps;
 mod check;
+mod cluster;
 mod error;
 mod graph;
 mod lumen;
 mod masks;
 mod medial;
+mod pinholes;
 mod prune;
 mod recentre;
 mod settings;

@@ -83,6 +83,16 @@ impl<'a> Lumen<'a> {
         })
     }
 
+    /// Length of the straight line between two points that is not lumen, to a quarter of a voxel, mm.
+    pub(crate) fn tissue_mm(&self, a: P3, b: P3) -> f64 {
+        let steps = (a.distance(b) / (0.25 * self.spacing_mm)).ceil().max(1.0);
+        let outside = (0..steps as usize).filter(|&i| {
+            let x = a.lerp(b, (i as f64 + 0.5) / steps);
+            self.domain.field.value(x) <= 0.0
+        });
+        outside.count() as f64 * a.distance(b) / steps
+    }
+
     /// The first wall along a ray from a point inside, not farther than `reach`.
     pub(crate) fn ray(&self, from: P3, direction: V3, reach: f64) -> Hit {
         let step = 0.5 * self.spacing_mm;

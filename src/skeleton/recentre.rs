@@ -21,8 +21,9 @@ const TANGENT_RADII: f64 = 0.5;
 /// A section this much larger than the median of those one to three radii farther out belongs to the junction. A taper
 /// of 1 : 28 in radius passes.
 const SWELLING: f64 = 1.15;
-/// How far from a junction swelling is looked for, in the junction's inscribed radii.
-const SWELLING_RADII: f64 = 4.0;
+/// How far from a junction swelling is looked for, in the junction's inscribed radii: the lumens of a graft at 20 degrees
+/// part 5.7 radii out.
+const SWELLING_RADII: f64 = 8.0;
 /// Length of the line through the centres next to a junction, in their radii. Short enough for bends of ten radii (.11
 /// radius off), long enough to average the ripple of a noisy wall.
 const AXIS_RADII: f64 = 3.0;
@@ -30,9 +31,9 @@ const AXIS_RADII: f64 = 3.0;
 /// [`PROXIMAL_STEPS`] times, it acts only along directions in which the lines say nothing.
 const PROXIMAL_WEIGHT: f64 = 0.02;
 const PROXIMAL_STEPS: usize = 20;
-/// How far a junction may move to the crossing of the axes, in its inscribed radii: thinning puts it towards the crotch,
-/// 1.3 radii from the crossing for a graft at 45 degrees.
-const JUNCTION_REACH_RADII: f64 = 2.5;
+/// How far a junction may move to the crossing of the axes, in the largest radius of its branches: thinning puts it towards the crotch,
+/// 1.3 radii from the crossing for a graft at 45 degrees, 4.3 for one at 20 (the crotch itself lies 1 / tan 10 = 5.7 out).
+const JUNCTION_REACH_RADII: f64 = 6.0;
 
 /// A medial line while it is recentred.
 #[derive(Clone)]
@@ -166,7 +167,7 @@ fn take_sections(
     }
     let s = abscissae(&line.points);
     for (end, node) in ends.iter().enumerate().filter(|(_, node)| node.kind == NodeKind::Junction) {
-        drop_swelling(&mut line.sections, &s, end, node.radius_mm);
+        drop_swelling(&mut line.sections, &s, end, node.radius_mm.max(line.radius));
     }
     Ok(())
 }
@@ -179,7 +180,9 @@ fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius
     let from_end = |i: usize| if end == 0 { s[i] } else { length - s[n - 1 - i] };
     let area = |sections: &[Option<Section>], i: usize| sections[index(i)].as_ref().map(|x| x.area);
     let mut last = None;
-    for i in (0..n).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
+    // sections that are missing behind all others are open at a cap, not leaking at the junction
+    let Some(outermost) = (0..n).rev().find(|&i| area(sections, i).is_some()) else { return };
+    for i in (0..outermost).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
         let Some(a) = area(sections, i) else {
             last = Some(i);
             continue;
@@ -219,7 +222,9 @@ fn place_nodes(graph: &mut MedialGraph, lines: &[Line], lumen: &Lumen<'_>) {
             continue;
         }
         let crossing = nearest_to_lines(&axes, node.position);
-        let near = crossing.distance(node.position) <= JUNCTION_REACH_RADII * node.radius_mm;
+        // a junction that thinning put into the crotch has a small sphere
+        let radius = at.iter().map(|&(e, _)| lines[e].radius).fold(node.radius_mm, f64::max);
+        let near = crossing.distance(node.position) <= JUNCTION_REACH_RADII * radius;
         if near && lumen.contains(crossing) && lumen.sees(node.position, crossing) {
             node.position = crossing;
         }

@@ -1,5 +1,6 @@
 //! All steps from f to the checked medial graph.
 
+use crate::cluster::merge_clusters;
 use crate::voxelise::spacing;
 use crate::{
     CapHint, Error, Lumen, MedialGraph, NodeKind, Settings, check, extend_to_caps, graph, prune, recentre, thin,
@@ -23,7 +24,7 @@ pub struct Report {
     pub subiterations: usize,
     /// Spurs dropped.
     pub spurs: usize,
-    /// What the reader of the result must know: `skeleton.coarse`, `skeleton.compact_piece`,
+    /// What the reader of the result must know: `skeleton.coarse`, `skeleton.compact_piece`, `skeleton.pinhole`,
     /// `skeleton.stub`, `skeleton.end_without_cap`.
     pub warnings: Vec<Warning>,
 }
@@ -58,7 +59,13 @@ pub fn medial_graph(
     };
     let (mut graph, pruning) = prune(graph(&thinned, &grid), &lumen, caps, &settings, ctx)?;
     let stubs = extend_to_caps(&mut graph, &lumen, caps);
-    recentre(&mut graph, &lumen, &settings, &ctx.part(0.5, 1.0))?;
+    recentre(&mut graph, &lumen, &settings, &ctx.part(0.5, 0.9))?;
+    // the junctions of a trifurcation only come together where their axes cross
+    let junctions = graph.nodes.len();
+    let mut graph = merge_clusters(graph);
+    if graph.nodes.len() < junctions {
+        recentre(&mut graph, &lumen, &settings, &ctx.part(0.9, 1.0))?;
+    }
     check(&graph, field, caps)?;
     let warnings = coarse.into_iter().chain(pruning.warnings).chain(stubs).chain(ends_without_cap(&graph)).collect();
     let report = Report {

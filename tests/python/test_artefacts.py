@@ -2,7 +2,7 @@
 
     VASCULUM_OUT=FOLDER python -m pytest tests/python/test_artefacts.py     (or: python tests/python/test_artefacts.py)
 
-Needs vtk and numpy.
+Needs vtk, numpy and networkx.
 """
 
 import csv
@@ -12,6 +12,7 @@ import os
 import pathlib
 import struct
 
+import networkx as nx
 import numpy as np
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkFeatureEdges, vtkMassProperties
@@ -83,6 +84,32 @@ def test_skeleton_has_vmtk_s_arrays():
         last = skeleton.GetCell(lines[-1]).GetPointIds()
         end = points["Abscissas"][last.GetId(last.GetNumberOfIds() - 1)]
         assert math.isclose(end, edge["length_mm"], rel_tol=1e-6)
+
+
+def test_skeleton_json_and_graphml_are_the_graph_of_result_json():
+    expected = result()["graph"]
+    node_link = nx.node_link_graph(json.loads((OUT / "skeleton.json").read_text()), edges="links")
+    graphs = [node_link]
+    if (OUT / "skeleton.graphml").exists():
+        graphs.append(nx.read_graphml(OUT / "skeleton.graphml", force_multigraph=True))
+    for graph in graphs:
+        assert graph.number_of_nodes() == len(expected["nodes"])
+        assert graph.number_of_edges() == len(expected["edges"])
+        cycles = graph.number_of_edges() - graph.number_of_nodes() + nx.number_connected_components(graph)
+        assert cycles == expected["cycles"]
+        lengths = sorted(data["length_mm"] for _, _, data in graph.edges(data=True))
+        assert np.allclose(lengths, sorted(e["length_mm"] for e in expected["edges"]))
+
+
+def test_swc_is_a_tree_of_the_same_length():
+    if not (OUT / "skeleton.swc").exists():
+        return
+    rows = np.loadtxt(OUT / "skeleton.swc")
+    parents = rows[:, 6].astype(int)
+    assert np.all(parents < rows[:, 0]) and parents[0] == -1
+    linked = parents > 0
+    steps = np.linalg.norm(rows[linked, 2:5] - rows[parents[linked] - 1, 2:5], axis=1)
+    assert math.isclose(steps.sum(), sum(e["length_mm"] for e in result()["graph"]["edges"]), rel_tol=1e-5)
 
 
 def test_contours_are_closed():

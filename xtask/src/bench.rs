@@ -1,10 +1,32 @@
-//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage.
+//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage; thinning beside others.
 
 use crate::{shell, tools};
 use anyhow::{Context, Result, ensure};
 use serde_json::Value;
 use std::fs;
 use std::path::Path;
+
+/// What `cargo xtask bench` measures.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+pub(crate) enum What {
+    /// The whole reconstruction, stage by stage.
+    Whole,
+    /// Thinning beside gaara and scikit-image on the same volumes.
+    Thinning,
+}
+
+/// Thin the same volumes with our code, gaara and scikit-image, interleaved, and show medians and ratios.
+pub(crate) fn thinning(repeat: usize) -> Result<()> {
+    ensure!(repeat > 0, "at least one repetition");
+    let mut build = shell::command("cargo");
+    build.args(["build", "--release", "--package", "skeleton", "--example", "thinning"]);
+    shell::run(build)?;
+    let work = tools::target()?.join("bench-thinning");
+    let mut bench = shell::command(tools::thinning_peers()?);
+    bench.arg(shell::root()?.join("tests/python/bench_thinning.py"));
+    bench.arg(tools::target()?.join("release/examples/thinning")).arg(&work).arg(repeat.to_string());
+    shell::run(bench)
+}
 
 /// Reconstruct the demo scan `repeat` times and show medians.
 pub(crate) fn run(binary: &Path, repeat: usize) -> Result<()> {

@@ -17,11 +17,19 @@ const ANGLES: [&str; 3] = ["graft_proximal", "graft_distal_planar", "distal_norm
 pub(crate) fn run(binary: &Path, first: u64, count: u64) -> Result<()> {
     ensure!(count > 0, "a survey of no scan proves nothing");
     let mut faults = Vec::new();
+    let mut inside = [[0, 0]; ANGLES.len()];
     println!("seed  {}  ends junctions  min angle  moved px  area bias %", ANGLES.join("  "));
     for seed in first..first + count {
         let row = scan(binary, seed).with_context(|| format!("seed {seed}"))?;
         println!("{seed:4}  {}", row.line);
+        for (count, within) in inside.iter_mut().zip(&row.in_band) {
+            count[0] += usize::from(*within == Some(true));
+            count[1] += usize::from(within.is_some());
+        }
         faults.extend(row.faults.into_iter().map(|f| format!("seed {seed}: {f}")));
+    }
+    for (name, [within, of]) in ANGLES.iter().zip(inside) {
+        println!("{name}: truth inside the 95 % band in {within} of {of}");
     }
     if faults.is_empty() {
         println!("{count} passed, 0 failed");
@@ -33,6 +41,8 @@ pub(crate) fn run(binary: &Path, first: u64, count: u64) -> Result<()> {
 struct Row {
     line: String,
     faults: Vec<String>,
+    /// Per angle whether the truth lies in its band; `None` without a band.
+    in_band: Vec<Option<bool>>,
 }
 
 fn scan(binary: &Path, seed: u64) -> Result<Row> {
@@ -56,10 +66,13 @@ fn scan(binary: &Path, seed: u64) -> Result<Row> {
 fn compare(result: &Value, truth: &Value) -> Result<Row> {
     let mut faults = Vec::new();
     let mut line = String::new();
+    let mut in_band = Vec::new();
     for name in ANGLES {
         let want = truth["angles"][name].as_f64().with_context(|| format!("truth has no {name}"))?;
         let angles = result["junctions"][0]["angles"].as_array().context("no junction")?;
-        let got = angles.iter().find(|a| a["name"] == name).and_then(|a| a["value"].as_f64());
+        let angle = angles.iter().find(|a| a["name"] == name);
+        let got = angle.and_then(|a| a["value"].as_f64());
+        in_band.push(angle.and_then(|a| Some((a["band95"][0].as_f64()?..=a["band95"][1].as_f64()?).contains(&want))));
         match got {
             Some(got) => {
                 line += &format!("{got:7.2} ({:+.2})  ", got - want);
@@ -90,7 +103,7 @@ fn compare(result: &Value, truth: &Value) -> Result<Row> {
         faults.push(format!("smoothing moved the wall by {moved:.2} px"));
     }
     line += &format!("{ends} {junctions}  {least:5.1}  {moved:5.2}  {}", area_bias(result, truth));
-    Ok(Row { line, faults })
+    Ok(Row { line, faults, in_band })
 }
 
 /// Area bias of every branch in percent: median section outside the junction against the truth's radius.

@@ -11,6 +11,7 @@ use std::path::PathBuf;
 const PYTHON_PACKAGES: &[&str] = &[
     "numpy",
     "vtk==9.5.2",
+    "networkx==3.6.1",
     "pydicom==3.0.2",
     "nibabel==5.4.2",
     "SimpleITK==2.5.7",
@@ -18,6 +19,8 @@ const PYTHON_PACKAGES: &[&str] = &[
     "jsonschema<5",
     "PyYAML",
 ];
+/// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
+const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
 const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1"];
 
 /// Build the release binary (with the portal) and give its path.
@@ -80,9 +83,22 @@ pub(crate) fn python() -> Result<PathBuf> {
     if !shell::has("python3") || !python_has_venv() {
         apt("Python with venv (programs that judge our files)", &["python3", "python3-venv"])?;
     }
-    let venv = folder()?.join("venv");
+    environment("venv", PYTHON_PACKAGES)
+}
+
+/// Python with the peers of thinning; the path of its interpreter.
+pub(crate) fn thinning_peers() -> Result<PathBuf> {
+    if !shell::has("python3") || !python_has_venv() {
+        apt("Python with venv (programs to measure against)", &["python3", "python3-venv"])?;
+    }
+    environment("venv-thinning", THINNING_PACKAGES)
+}
+
+/// A virtual environment with these packages; the path of its interpreter.
+fn environment(name: &str, packages: &[&str]) -> Result<PathBuf> {
+    let venv = folder()?.join(name);
     let interpreter = venv.join("bin/python");
-    let wanted = PYTHON_PACKAGES.join("\n");
+    let wanted = packages.join("\n");
     let stamp = venv.join("packages.txt");
     if fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
         return Ok(interpreter);
@@ -91,7 +107,7 @@ pub(crate) fn python() -> Result<PathBuf> {
     make.args(["-m", "venv", "--clear"]).arg(&venv);
     shell::run(make)?;
     let mut install = shell::command(&interpreter);
-    install.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]).args(PYTHON_PACKAGES);
+    install.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]).args(packages);
     shell::run(install)?;
     fs::write(&stamp, wanted)?;
     Ok(interpreter)

@@ -126,7 +126,7 @@ const PLAN: &[(&str, Rule)] = &[
         "morphometry",
         Object(&[("fit_from_diameters", Number(0.0, 100.0)), ("fit_to_diameters", Number(0.1, 100.0))], Optional),
     ),
-    ("outputs", Words(&["surface", "skeleton", "volume"])),
+    ("outputs", Words(&["surface", "skeleton", "volume", "graphml", "swc"])),
 ];
 
 const GEOMETRY: &[(&str, Rule)] = &[

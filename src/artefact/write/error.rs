@@ -1,4 +1,5 @@
-//! What can go wrong when artefacts are written. All of it is our own fault: the input was accepted long before.
+//! What can go wrong when artefacts are written. All but [`Error::Loops`] is our own fault: the input was
+//! accepted long before.
 
 use space::{FaultKind, Faulty};
 
@@ -39,6 +40,16 @@ pub enum Error {
         /// The encoder's words.
         reason: String,
     },
+    /// SWC holds trees only.
+    #[error(
+        "{artefact} holds trees only and this vessel has {cycles} loop(s): leave `swc` out of the plan's outputs and ask for `graphml`"
+    )]
+    Loops {
+        /// Artefact name.
+        artefact: &'static str,
+        /// Independent loops.
+        cycles: usize,
+    },
     /// The artefact is larger than its format can say.
     #[error(
         "{artefact} would take {bytes} bytes; its format ends at {limit}: ask for a coarser surface (plan field surface.edge_mm)"
@@ -57,6 +68,7 @@ impl Faulty for Error {
     fn kind(&self) -> FaultKind {
         match self {
             Self::TooLarge { .. } => FaultKind::Limit,
+            Self::Loops { .. } => FaultKind::Input,
             _ => FaultKind::Internal,
         }
     }
@@ -66,6 +78,7 @@ impl Faulty for Error {
             Self::Mismatch { .. } => "artefact.mismatch",
             Self::Encode { .. } => "artefact.encode",
             Self::TooLarge { .. } => "artefact.too_large",
+            Self::Loops { .. } => "artefact.loops",
         }
     }
 }

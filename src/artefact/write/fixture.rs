@@ -7,7 +7,9 @@ use crate::reconstruction::{
     SurfaceFacts,
 };
 use imaging::{Axis, Contours};
-use morphometry::{Angle, Branch, ByDistance, Helix, Junction, Morphometry, Role, Section, VmtkAngles};
+use morphometry::{
+    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Section, Stenosis, VmtkAngles,
+};
 use skeleton::{Edge, MedialGraph, Node, NodeKind};
 use space::{P3, Place, V3, Warning};
 use std::collections::BTreeMap;
@@ -110,10 +112,22 @@ fn branch(id: usize) -> (Edge, Branch) {
         area_mm2: (i >= 4).then(|| std::f64::consts::PI * (r(i) + 0.06).powi(2)),
         perimeter_mm: (i >= 4).then(|| std::f64::consts::TAU * (r(i) + 0.07)),
         curvature_per_mm: Some(0.01),
+        shape: (i >= 4).then_some(0.98),
+        area_error_mm2: (i >= 4).then_some(0.2),
+        curvature_error_per_mm: Some(0.002),
         in_junction: i < 10,
         open: i + 1 == n,
     };
-    let helix = Helix { radius_mm: 2.0, pitch_mm: 60.0, curvature_per_mm: 0.02, torsion_per_mm: 0.09, rms_mm: 0.02 };
+    let helix = Helix {
+        radius_mm: 2.0,
+        pitch_mm: 60.0,
+        curvature_per_mm: 0.02,
+        torsion_per_mm: 0.09,
+        rms_mm: 0.02,
+        enough: CurveKind::Helix,
+        curvature_band95: Some([0.018, 0.022]),
+        torsion_band95: Some([0.08, 0.1]),
+    };
     let b = Branch {
         id,
         role,
@@ -123,6 +137,8 @@ fn branch(id: usize) -> (Edge, Branch) {
         tortuosity: 1.0,
         direction: end.normalised(),
         diameter_mm: Some(2.0 * radius),
+        diameter_band95_mm: Some([1.96 * radius, 2.04 * radius]),
+        stenosis: Some(Stenosis { area_ratio: 0.97, abscissa_mm: 0.6 * end.length() }),
         sections: (0..n).map(section).collect(),
         helix: (role == Role::Distal).then_some(helix),
     };
@@ -149,7 +165,7 @@ fn angles() -> Vec<Angle> {
             value_deg: Some(value),
             band95_deg: Some([value - 0.6, value + 0.6]),
             window_diameters: Some([1.6, 4.0]),
-            by_distance: Some(ByDistance { diameters, value_deg }),
+            by_distance: Some(ByDistance { residual_mm: vec![Some(0.02); diameters.len()], diameters, value_deg }),
         }
     };
     let mut all: Vec<Angle> = names.iter().zip(values).enumerate().map(angle).collect();

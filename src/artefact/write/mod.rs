@@ -21,6 +21,7 @@ mod result;
 mod slices;
 mod stl;
 mod style;
+mod trees;
 mod vtp;
 
 #[cfg(test)]
@@ -39,6 +40,7 @@ pub use provenance::{Provenance, StageTime, provenance};
 pub use result::{result_json, skeleton_json};
 pub use slices::slice_pictures;
 pub use stl::surface_stl;
+pub use trees::{skeleton_graphml, skeleton_swc};
 
 use crate::Reconstruction;
 use sha2::{Digest, Sha256};
@@ -52,6 +54,10 @@ pub const ANGLES_CSV: &str = "angles.csv";
 pub const SKELETON_JSON: &str = "skeleton.json";
 /// The medial lines for VTK.
 pub const SKELETON_VTP: &str = "skeleton.vtp";
+/// The medial graph for graph programs, when asked for.
+pub const SKELETON_GRAPHML: &str = "skeleton.graphml";
+/// The medial lines as a tree, when asked for.
+pub const SKELETON_SWC: &str = "skeleton.swc";
 /// The surface for VTK.
 pub const SURFACE_VTP: &str = "surface.vtp";
 /// The surface and the medial lines for viewers.
@@ -106,9 +112,26 @@ pub fn media_type(name: &str) -> &'static str {
         Some("stl") => "model/stl",
         Some("vtp" | "vtu") => "application/vnd.vtk+xml",
         Some("zip") => "application/zip",
-        Some("xml") => "application/xml",
+        Some("xml" | "graphml") => "application/xml",
+        Some("swc") => "text/plain; charset=utf-8",
         _ => "application/octet-stream",
     }
+}
+
+/// The artefacts that `outputs` of the plan ask for beyond [`write_all`]: `graphml` and `swc`.
+///
+/// # Errors
+/// [`Error::Loops`] for `swc` of a graph with loops; [`Error::NotFinite`].
+pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<NamedBytes>, Error> {
+    let asked = |name: &str| outputs.iter().any(|o| o == name);
+    let mut files = Vec::new();
+    if asked("graphml") {
+        files.push(NamedBytes { name: SKELETON_GRAPHML, bytes: skeleton_graphml(r)? });
+    }
+    if asked("swc") {
+        files.push(NamedBytes { name: SKELETON_SWC, bytes: skeleton_swc(r)? });
+    }
+    Ok(files)
 }
 
 /// Every artefact but provenance.json, in this order: result.json, angles.csv, skeleton.json, skeleton.vtp, surface.vtp,

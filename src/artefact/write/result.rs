@@ -1,14 +1,15 @@
 //! result.json and skeleton.json: the numbers, under the names and in the order of contract.md.
 //!
 //! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
-//! `displacement_mm`, `patches` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`; `junctions[].branches`.
+//! `displacement_mm`, `patches` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
+//! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`.
 //! What could not be had is null.
 
 use super::json::{Json, warning};
 use super::{Error, RESULT_JSON, SKELETON_JSON};
 use crate::Reconstruction;
 use crate::reconstruction::{CapFacts, Range};
-use morphometry::{Angle, Branch, Helix, Junction, Section, VmtkAngles};
+use morphometry::{Angle, Branch, Helix, Junction, Section, Stenosis, VmtkAngles};
 use skeleton::{MedialGraph, NodeKind};
 
 /// result.json.
@@ -147,7 +148,13 @@ fn branch(b: &Branch) -> Json {
         ("diameter_mm", b.diameter_mm.into()),
         ("samples", samples(&b.sections)),
         ("helix", b.helix.map_or(Json::Null, helix)),
+        ("diameter_band95", b.diameter_band95_mm.into()),
+        ("stenosis", b.stenosis.map_or(Json::Null, stenosis)),
     ])
+}
+
+fn stenosis(s: Stenosis) -> Json {
+    Json::Object(vec![("area_ratio", s.area_ratio.into()), ("abscissa_mm", s.abscissa_mm.into())])
 }
 
 fn samples(sections: &[Section]) -> Json {
@@ -166,6 +173,9 @@ fn samples(sections: &[Section]) -> Json {
         ("in_junction", column(sections, |s| s.in_junction)),
         ("open", column(sections, |s| s.open)),
         ("tangent", column(sections, |s| s.tangent)),
+        ("shape", column(sections, |s| s.shape)),
+        ("area_error_mm2", column(sections, |s| s.area_error_mm2)),
+        ("curvature_error_per_mm", column(sections, |s| s.curvature_error_per_mm)),
     ])
 }
 
@@ -182,9 +192,11 @@ fn helix(h: Helix) -> Json {
         ("pitch_mm", h.pitch_mm.into()),
         ("curvature_per_mm", h.curvature_per_mm.into()),
         ("torsion_per_mm", h.torsion_per_mm.into()),
-        ("torsion_band95", Json::Null),
+        ("torsion_band95", h.torsion_band95.into()),
         ("rms_mm", h.rms_mm.into()),
         ("handedness", handedness),
+        ("curvature_band95", h.curvature_band95.into()),
+        ("enough", h.enough.name().into()),
     ])
 }
 
@@ -206,6 +218,7 @@ fn angle(a: &Angle) -> Json {
         Json::Object(vec![
             ("diameters", Json::list(d.diameters.iter().copied())),
             ("value", Json::list(d.value_deg.iter().copied())),
+            ("residual_mm", Json::list(d.residual_mm.iter().copied())),
         ])
     });
     Json::Object(vec![

@@ -426,3 +426,109 @@ fn sections_beyond_a_cut_are_open_and_cancelled_work_stops() {
     let e = measure(&case.graph, &case.field, &case.cuts, &Settings::default(), &ctx).unwrap_err();
     assert_eq!(e.code(), "cancelled");
 }
+
+/// Draws that move the whole field, or one side of it, by a fixed length with alternating signs.
+struct Shifts {
+    radial_mm: f64,
+    /// The field's centre moves along this, mm.
+    move_mm: DVec3,
+    field: Tubes,
+}
+
+impl implicit::Draws for Shifts {
+    fn count(&self) -> usize {
+        2
+    }
+    fn differences(&self, draw: usize, at: &[P3], out: &mut [f64]) {
+        let sign = if draw == 0 { 1.0 } else { -1.0 };
+        for (o, x) in out.iter_mut().zip(at) {
+            *o = sign * (self.radial_mm - self.field.gradient(*x).1.raw().dot(self.move_mm));
+        }
+    }
+}
+
+#[test]
+fn bands_have_the_size_of_the_draws() {
+    let case = anastomosis(45.0, 15.0, [2.5, 3.0, 2.0], 0.0);
+    let run = |radial_mm: f64, move_mm: DVec3| {
+        let draws = Shifts { radial_mm, move_mm, field: Tubes(case.field.0.clone()) };
+        let settings = Settings { roles: points(&case, [true; 3]), ..Settings::default() };
+        let ctx = Ctx::new(2).unwrap();
+        morphometry::measure_with_bands(&case.graph, &case.field, &case.cuts, Some(&draws), &settings, &ctx).unwrap()
+    };
+    // every wall .1 mm out or in: diameters +- .2, areas +- 2 pi r .1, angles not at all
+    let m = run(0.1, DVec3::ZERO);
+    for (b, r) in m.branches.iter().zip([2.5, 3.0, 2.0]) {
+        let [low, high] = b.diameter_band95_mm.unwrap();
+        assert!((0.5 * (high - low) - 1.96 * 0.2).abs() < 0.01, "{low} {high}");
+        let s = b.sections.iter().find(|s| !s.in_junction && !s.open && s.area_error_mm2.is_some()).unwrap();
+        assert!((s.area_error_mm2.unwrap() / (std::f64::consts::TAU * r * 0.1) - 1.0).abs() < 0.03, "{s:?}");
+        assert!(s.curvature_error_per_mm.is_none_or(|e| e < 1e-3), "{s:?}");
+    }
+    for a in &m.junctions[0].angles {
+        let [low, high] = a.band95_deg.unwrap();
+        assert!(high - low < 0.01, "{} {low} {high}", a.name);
+    }
+    // all moved as one: nothing changes but the place
+    let m = run(0.0, DVec3::new(0.05, -0.03, 0.04));
+    for a in &m.junctions[0].angles {
+        let [low, high] = a.band95_deg.unwrap();
+        assert!(high - low < 0.02, "{} {low} {high}", a.name);
+    }
+    assert!(m.branches.iter().all(|b| b.diameter_band95_mm.is_some_and(|[low, high]| high - low < 0.01)));
+    let without = run_with(&case, Settings::default(), 1).unwrap();
+    assert!(without.junctions[0].angles.iter().all(|a| a.band95_deg.is_none()));
+}
+
+#[test]
+fn every_junction_of_a_tree_is_measured() {
+    // a host along z with a side branch at z = 0 and another at z = 40
+    let mut case = Case { field: Tubes(Vec::new()), graph: MedialGraph::default(), cuts: Vec::new() };
+    let (low, high) = (DVec3::ZERO, DVec3::new(0.0, 0.0, 40.0));
+    case.graph.nodes = vec![node(NodeKind::Junction, low, 2.0), node(NodeKind::Junction, high, 2.0)];
+    let line = |from: DVec3, d: DVec3, length: f64| -> Vec<DVec3> {
+        (0..=(length / 0.4) as usize).map(|k| from + d * (0.4 * k as f64)).collect()
+    };
+    let between = line(low, DVec3::Z, 40.0);
+    case.field.0.push((vec![low, high], 2.0));
+    case.graph.edges.push(Edge {
+        nodes: [0, 1],
+        radius_mm: vec![2.0; between.len()],
+        points: between.into_iter().map(P3::from_raw).collect(),
+    });
+    let side = |angle: f64, y: f64| {
+        let (s, c) = angle.to_radians().sin_cos();
+        DVec3::new(s, y, c).normalize()
+    };
+    let (a, b) = (side(60.0, 0.0), side(50.0, 0.0));
+    for (from, d) in [(0, -DVec3::Z), (0, a), (1, DVec3::Z), (1, b)] {
+        let start = if from == 0 { low } else { high };
+        case.field.0.push((vec![start, start + d * 36.0], 2.0));
+        add(&mut case.graph, from, &line(start, d, 30.0), 2.0);
+        case.cuts.push(CutPlane { point: P3::from_raw(start + d * 30.0), outward: V3::from_raw(d) });
+    }
+    // planes of side branches would cut the others: keep only those across the host
+    case.cuts = vec![case.cuts[0], case.cuts[2]];
+    let m = run(&case, Roles::default()).unwrap();
+    assert_eq!(m.junctions.len(), 2);
+    for (j, expected) in m.junctions.iter().zip([60.0, 50.0]) {
+        let value = angle(j, "graft_host_a").unwrap_or_else(|| panic!("{:?}", m.warnings));
+        assert!((value - expected).abs() < 0.05, "{value} for {expected}");
+    }
+}
+
+#[test]
+fn shape_narrowing_and_kind_of_curve_are_told() {
+    let case = anastomosis(45.0, 15.0, [2.5, 3.0, 2.0], 0.0);
+    let m = run(&case, Roles::default()).unwrap();
+    for b in &m.branches {
+        assert!(b.stenosis.unwrap().area_ratio > 0.99, "{:?}", b.stenosis);
+        let shapes: Vec<f64> = b.sections.iter().filter(|s| !s.in_junction).filter_map(|s| s.shape).collect();
+        assert!(shapes.len() > 20 && shapes.iter().all(|s| *s > 0.995 && *s <= 1.0), "{shapes:?}");
+    }
+    for a in &m.junctions[0].angles {
+        let curve = a.by_distance.as_ref().unwrap();
+        assert_eq!(curve.residual_mm.len(), curve.diameters.len());
+        assert!(curve.residual_mm.iter().flatten().all(|r| *r < 0.01), "{}: {:?}", a.name, curve.residual_mm);
+    }
+}

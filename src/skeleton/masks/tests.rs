@@ -10,6 +10,7 @@
 #![allow(clippy::unwrap_used)]
 
 use super::*;
+use crate::masks::drawn::{Mask, bit, deletable, masks};
 use exec::Ctx;
 
 const CENTRE: u32 = 1 << 13;
@@ -206,5 +207,64 @@ fn every_direction_has_21_masks_that_need_background_towards_it_and_are_those_of
     };
     for m in &up {
         assert!(up.contains(&Mask { zero: mirrored(m.zero), one: mirrored(m.one), any: mirrored(m.any) }));
+    }
+}
+
+/// The words of 64 neighbourhoods, one per bit.
+fn words(of: impl Fn(u32) -> u32) -> [u64; 27] {
+    let mut words = [0; 27];
+    for b in 0..64 {
+        let n = of(b);
+        for (v, word) in words.iter_mut().enumerate() {
+            *word |= u64::from(n >> v & 1) << b;
+        }
+    }
+    words
+}
+
+#[test]
+fn the_algebra_on_words_is_the_masks_on_all_2_to_26_neighbourhoods() {
+    let set = masks(Direction::Up);
+    let ctx = Ctx::new(0).unwrap();
+    let differing = ctx
+        .map_range(1 << 10, |block| {
+            let code = |high: u32, b: u32| neighbourhood(((block as u32) << 16) | (high << 6) | b);
+            (0..1 << 10)
+                .filter(|&high| {
+                    let expected = (0..64).fold(0, |m, b| m | u64::from(deletable(&set, code(high, b))) << b);
+                    matches::<0>(&words(|b| code(high, b))) != expected
+                })
+                .count()
+        })
+        .unwrap();
+    assert_eq!(differing.iter().sum::<usize>(), 0);
+}
+
+#[test]
+fn the_algebra_of_every_direction_is_its_masks() {
+    let mut state = 9_u64;
+    for _ in 0..3000 {
+        let words: [u64; 27] = std::array::from_fn(|_| {
+            let mut next = || {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                state ^ (state >> 29)
+            };
+            let (a, b) = (next(), next());
+            if next() & 1 == 0 { a & b } else { a }
+        });
+        let found = [
+            matches::<0>(&words),
+            matches::<1>(&words),
+            matches::<2>(&words),
+            matches::<3>(&words),
+            matches::<4>(&words),
+            matches::<5>(&words),
+        ];
+        for (d, found) in Direction::ALL.into_iter().zip(found) {
+            let set = masks(d);
+            let n = |b: u32| (0..27).fold(0, |n, v| n | (((words[v as usize] >> b & 1) as u32) << v));
+            let expected = (0..64).fold(0, |m, b| m | u64::from(n(b) & CENTRE != 0 && deletable(&set, n(b))) << b);
+            assert_eq!(found, expected, "{d:?}");
+        }
     }
 }

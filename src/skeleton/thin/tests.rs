@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used)]
 
 use super::*;
-use crate::masks::bit;
+use crate::masks::drawn::{bit, deletable, masks};
 
 struct Random(u64);
 

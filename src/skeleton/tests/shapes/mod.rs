@@ -151,3 +151,100 @@ pub(crate) fn counts(graph: &MedialGraph) -> (usize, usize, usize, usize) {
     let ends = graph.nodes.iter().filter(|n| n.kind == skeleton::NodeKind::End).count();
     (ends, graph.nodes.len() - ends, graph.cycles(), graph.components())
 }
+
+/// A field whose wall is rough: value noise of one lattice cell, standard deviation `sigma_mm` at the lattice points.
+pub(crate) struct Rough<'a> {
+    pub(crate) smooth: &'a dyn Field,
+    pub(crate) sigma_mm: f64,
+    pub(crate) cell_mm: f64,
+    pub(crate) seed: u64,
+}
+
+impl Rough<'_> {
+    fn at(&self, i: [i64; 3]) -> f64 {
+        let mut h = self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        for c in i {
+            h = (h ^ c as u64).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            h ^= h >> 29;
+        }
+        // the sum of four uniform numbers is near enough to normal
+        (0..4).map(|k| (h >> (16 * k) & 0xffff) as f64 / 65536.0 - 0.5).sum::<f64>() * 3.0_f64.sqrt() * self.sigma_mm
+    }
+
+    fn noise(&self, x: P3) -> f64 {
+        let p = x.to_array().map(|c| c / self.cell_mm);
+        let (i, t) = (p.map(|c| c.floor() as i64), p.map(|c| c - c.floor()));
+        (0..8)
+            .map(|d: usize| {
+                let side = |a: usize| (d >> a & 1) as i64;
+                let weight: f64 = (0..3).map(|a| if side(a) == 1 { t[a] } else { 1.0 - t[a] }).product();
+                weight * self.at([i[0] + side(0), i[1] + side(1), i[2] + side(2)])
+            })
+            .sum()
+    }
+}
+
+impl Field for Rough<'_> {
+    fn value(&self, x: P3) -> f64 {
+        self.smooth.value(x) + self.noise(x)
+    }
+    fn gradient(&self, x: P3) -> (f64, V3) {
+        let (f, g) = self.smooth.gradient(x);
+        let h = 1e-4 * self.cell_mm;
+        let d = |e: V3| (self.noise(x + e * h) - self.noise(x - e * h)) / (2.0 * h);
+        (f + self.noise(x), g + V3::new(d(V3::X), d(V3::Y), d(V3::Z)))
+    }
+    fn hessian(&self, x: P3) -> (f64, V3, DMat3) {
+        let (f, g) = self.gradient(x);
+        (f, g, DMat3::ZERO)
+    }
+    fn bounds(&self) -> Aabb<Patient> {
+        self.smooth.bounds()
+    }
+}
+
+/// Uniform numbers from a seed.
+pub(crate) struct Draw(pub(crate) u64);
+
+impl Draw {
+    pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        low + (high - low) * ((z ^ z >> 31) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
+
+/// An anastomosis as a stack of slices sees it: two planes across z end the data, so that the graft's cap is oblique.
+/// Graft at 20 to 65 degrees, radii .5 to 1.15 of the host's 3 mm, the host bent by up to 20 degrees each way.
+pub(crate) fn drawn_anastomosis(seed: u64) -> Star {
+    let mut draw = Draw(seed);
+    let turn = draw.between(0.0, std::f64::consts::TAU);
+    let (host, ratio) = (3.0, draw.between(0.5, 1.15));
+    let graft = host * ratio;
+    let angle = draw.between(20.0, 65.0).to_radians();
+    let bend = [draw.between(-20.0, 20.0), draw.between(-20.0, 20.0)].map(|x: f64| x.to_radians().tan());
+    let direction = |x: f64, y: f64, z: f64| {
+        V3::new(x * turn.cos() - y * turn.sin(), x * turn.sin() + y * turn.cos(), z).normalised().unwrap()
+    };
+    let directions =
+        [direction(0.0, 0.0, 1.0), direction(bend[0], bend[1], -1.0), direction(angle.sin(), 0.0, angle.cos())];
+    // the caps of host and graft lie in one plane, two radii apart
+    let apart = graft / angle.cos() + 3.0 * host;
+    let half = (apart / angle.tan()).max(4.0 * host);
+    let centre = P3::new(draw.between(-1.0, 1.0), draw.between(-1.0, 1.0), draw.between(-1.0, 1.0));
+    let radii = [host, host, graft];
+    let lengths = directions.map(|d| half / d.z().abs());
+    let branches: Vec<(V3, f64, f64)> = (0..3).map(|i| (directions[i], lengths[i], radii[i])).collect();
+    let mut star = star(centre, &branches);
+    for i in 0..3 {
+        let (cut, cap) = opening(i as u32 + 1, centre + directions[i] * lengths[i], V3::Z * directions[i].z().signum());
+        (star.cuts[i], star.caps[i]) = (cut, cap);
+        // an oblique section reaches farther along the vessel than its axis
+        let reach = 2.0 * radii[i] * (1.0 + directions[i].z().abs().acos().tan());
+        star.vessel.tubes[i].1 = centre + directions[i] * (lengths[i] + reach);
+    }
+    star.vessel.bounds = Aabb::around(star.caps.iter().map(|c| c.centroid)).unwrap().grown(4.0 * host);
+    star
+}

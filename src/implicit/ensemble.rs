@@ -1,0 +1,244 @@
+//! What the data leave open: functions that fit as well as the fitted one, for error bands.
+//!
+//! The fit is the posterior mean of a random field with generalised covariance s |x - x'|^3 under the constraints' noise
+//! (see [`crate::fit`]). A draw from that posterior differs from the mean by g - fit(g(x_i) + e_i), where g is a draw of
+//! the field itself and e_i one of the noise (Matheron's rule; Chiles and Delfiner 2012, 7.3): bands widen where slices
+//! are far apart, because there g is not tied down. It takes one more solve with the same factor per draw, and nothing
+//! is assumed of the solver but that it solves for any right-hand side. Perturbing the wall alone (e without g) was
+//! rejected: it says that the shape between two slices is known exactly.
+//!
+//! g is a sum of plane waves. |h|^3 has the spectral density 96 pi / k^6 in three dimensions; wave numbers are drawn
+//! log-uniformly from the size of the data to half the spacing of the wall points, each wave weighted by the density.
+//! The errors of a contour are those of its smoothing spline: not independent from point to point but a trigonometric
+//! polynomial along the contour with as many terms as the spline has degrees of freedom ([`CONTOUR_MODES`]).
+
+use crate::Error;
+use crate::constraints::Constraints;
+use crate::kernel::Centres;
+use crate::system::{Factor, Scale};
+use exec::Ctx;
+use space::P3;
+
+/// Terms of a contour's error: mean, two of position, two of ellipticity, two more. Smoothing splines of discs of 5 to 10
+/// px at SNR 10 to 30 have 4 to 8 degrees of freedom.
+const CONTOUR_MODES: usize = 7;
+/// Plane waves of a draw: some 25 per factor of two in wave number.
+const WAVES: usize = 256;
+/// Smallest wave number, in scaled coordinates (the farthest constraint at distance 1): what is longer is as good as a
+/// polynomial of second degree, which the constraints determine.
+const WAVE_NUMBER_MIN: f64 = 0.5;
+/// Wall points from which their spacing is estimated.
+const SPACING_SAMPLES: usize = 64;
+
+/// Differences of drawn functions from the fitted one.
+pub trait Draws: Sync {
+    /// How many there are.
+    fn count(&self) -> usize;
+    /// The difference of a draw from the fitted function at some points, mm; `out` has the length of `at`.
+    fn differences(&self, draw: usize, at: &[P3], out: &mut [f64]);
+}
+
+/// Draws from the posterior of a fit.
+#[derive(Clone, Debug, Default)]
+pub struct Ensemble {
+    draws: Vec<Draw>,
+    scale: Option<Scale>,
+}
+
+#[derive(Clone, Debug)]
+struct Draw {
+    waves: Vec<Wave>,
+    centres: Centres,
+    polynomial: [f64; 4],
+}
+
+/// amplitude cos(k . t + phase), t scaled.
+#[derive(Clone, Copy, Debug)]
+struct Wave {
+    k: [f64; 3],
+    phase: f64,
+    amplitude: f64,
+}
+
+impl Ensemble {
+    /// `count` draws for a factorised fit with scale `s` of the field. The same for any number of threads.
+    pub(crate) fn new(
+        c: &Constraints,
+        factor: &Factor,
+        (scale, s): (Scale, f64),
+        count: usize,
+        ctx: &Ctx,
+    ) -> Result<Self, Error> {
+        let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
+        let longest = 2.0 * std::f64::consts::TAU / spacing(&points[..c.wall]).max(1e-4);
+        let draw = |number: usize| {
+            let mut normal = Normal::new(number as u64);
+            let waves = waves(s, longest.max(2.0 * WAVE_NUMBER_MIN), &mut normal);
+            let mut values = errors(c, &mut normal);
+            for (v, p) in values.iter_mut().zip(&points) {
+                *v += sum(&waves, *p);
+            }
+            let (coefficients, polynomial) = factor.solve(&values);
+            Draw { waves, centres: Centres::new(&points, &coefficients), polynomial }
+        };
+        Ok(Self { draws: ctx.map_range(count, draw)?, scale: Some(scale) })
+    }
+}
+
+impl Draws for Ensemble {
+    fn count(&self) -> usize {
+        self.draws.len()
+    }
+
+    fn differences(&self, draw: usize, at: &[P3], out: &mut [f64]) {
+        let (Some(draw), Some(scale)) = (self.draws.get(draw), self.scale) else { return };
+        let targets: Vec<[f64; 3]> = at.iter().map(|&x| scale.apply(x)).collect();
+        draw.centres.values(&targets, out);
+        let b = &draw.polynomial;
+        for (o, t) in out.iter_mut().zip(&targets) {
+            *o = sum(&draw.waves, *t) - *o - b[0] - b[1] * t[0] - b[2] * t[1] - b[3] * t[2];
+        }
+    }
+}
+
+fn sum(waves: &[Wave], t: [f64; 3]) -> f64 {
+    waves.iter().fold(0.0, |s, w| s + w.amplitude * (w.k[0] * t[0] + w.k[1] * t[1] + w.k[2] * t[2] + w.phase).cos())
+}
+
+/// Median distance of a wall point to the next, scaled.
+fn spacing(wall: &[[f64; 3]]) -> f64 {
+    let stride = wall.len().div_ceil(SPACING_SAMPLES).max(1);
+    let distance = |i: usize, j: usize| (0..3).fold(0.0, |s, a| s + (wall[i][a] - wall[j][a]).powi(2)).sqrt();
+    let nearest = |i: usize| (0..wall.len()).filter(|&j| j != i).map(|j| distance(i, j)).fold(f64::INFINITY, f64::min);
+    let mut d: Vec<f64> = (0..wall.len()).step_by(stride).map(nearest).collect();
+    d.sort_by(f64::total_cmp);
+    d.get(d.len() / 2).copied().unwrap_or(1.0)
+}
+
+/// Waves of a field with covariance s |h|^3. With k drawn log-uniformly over a range of ln ratio L and directions evenly, the
+/// density s 96 pi / k^6 per d^3k / (2 pi)^3 gives each of M waves the variance 48 s L / (pi M k^3).
+fn waves(s: f64, longest: f64, normal: &mut Normal) -> Vec<Wave> {
+    let range = (longest / WAVE_NUMBER_MIN).ln();
+    (0..WAVES)
+        .map(|i| {
+            // one wave in each of M equal parts of the range
+            let k = WAVE_NUMBER_MIN * (range * (i as f64 + normal.uniform()) / WAVES as f64).exp();
+            let d = [normal.next(), normal.next(), normal.next()];
+            let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt().max(f64::MIN_POSITIVE);
+            let variance = 48.0 * s * range / (std::f64::consts::PI * WAVES as f64 * k.powi(3));
+            // a wave of random phase and normal amplitude with variance v has amplitude sqrt(2 v) times a normal number
+            let amplitude = (2.0 * variance).sqrt() * normal.next();
+            Wave { k: d.map(|x| x * k / length), phase: std::f64::consts::TAU * normal.uniform(), amplitude }
+        })
+        .collect()
+}
+
+/// One draw of the constraints' errors: a trigonometric polynomial along each contour, independent elsewhere.
+fn errors(c: &Constraints, normal: &mut Normal) -> Vec<f64> {
+    let mut out = Vec::with_capacity(c.points.len());
+    let mut i = 0;
+    while i < c.wall {
+        let Some(curve) = c.curve[i] else {
+            out.push(c.sigma_mm[i] * normal.next());
+            i += 1;
+            continue;
+        };
+        let count = c.curve[i..c.wall].iter().take_while(|&&other| other == Some(curve)).count();
+        let terms: Vec<f64> = (0..CONTOUR_MODES).map(|_| normal.next()).collect();
+        for k in 0..count {
+            let angle = std::f64::consts::TAU * k as f64 / count as f64;
+            let mut error = terms[0];
+            for (m, pair) in terms[1..].chunks(2).enumerate() {
+                let (sin, cos) = ((m + 1) as f64 * angle).sin_cos();
+                error += std::f64::consts::SQRT_2 * (pair[0] * cos + pair.get(1).copied().unwrap_or(0.0) * sin);
+            }
+            out.push(c.sigma_mm[i + k] * error / (CONTOUR_MODES as f64).sqrt());
+        }
+        i += count;
+    }
+    out.extend(c.sigma_mm[c.wall..].iter().map(|sigma| sigma * normal.next()));
+    out
+}
+
+/// Normal and uniform numbers from a seed (splitmix64, Box and Muller).
+struct Normal {
+    state: u64,
+    second: Option<f64>,
+}
+
+impl Normal {
+    fn new(seed: u64) -> Self {
+        Self { state: seed.wrapping_mul(0xd134_2543_de82_ef95) ^ 0x5bd1_e995_7f4a_7c15, second: None }
+    }
+
+    fn uniform(&mut self) -> f64 {
+        self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.state;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn next(&mut self) -> f64 {
+        if let Some(x) = self.second.take() {
+            return x;
+        }
+        let (u, v) = (1.0 - self.uniform(), std::f64::consts::TAU * self.uniform());
+        let r = (-2.0 * u.ln()).sqrt();
+        self.second = Some(r * v.sin());
+        r * v.cos()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// For weights that annihilate polynomials of first degree, the variance of sum w_i g(x_i) is s sum w_i w_j |x_i - x_j|^3.
+    #[test]
+    fn waves_have_the_covariance_of_the_kernel() {
+        let h = 0.1;
+        let (points, weights) = ([0.0, h, 2.0 * h, 3.0 * h], [1.0, -3.0, 3.0, -1.0]);
+        let mut expected = 0.0;
+        for i in 0..4 {
+            for j in 0..4 {
+                expected += weights[i] * weights[j] * f64::powi(f64::abs(points[i] - points[j]), 3);
+            }
+        }
+        let mut normal = Normal::new(3);
+        let draws = 4000;
+        let mut sum_of_squares = 0.0;
+        for _ in 0..draws {
+            let waves = waves(2.0, 2000.0, &mut normal);
+            let x: f64 = (0..4).map(|i| weights[i] * sum(&waves, [points[i], 0.3, -0.2])).sum();
+            sum_of_squares += x * x;
+        }
+        let ratio = sum_of_squares / f64::from(draws) / (2.0 * expected);
+        assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
+    }
+
+    #[test]
+    fn a_contour_s_errors_have_the_stated_size_and_its_mean_that_of_its_terms() {
+        let mut normal = Normal::new(11);
+        let n = 40;
+        let c = Constraints {
+            points: vec![P3::ORIGIN; n],
+            values: vec![0.0; n],
+            sigma_mm: vec![0.1; n],
+            wall: n,
+            interior: Vec::new(),
+            curve: vec![Some(0); n],
+        };
+        let draws = 3000;
+        let (mut square, mut mean) = (0.0, 0.0);
+        for _ in 0..draws {
+            let e = errors(&c, &mut normal);
+            square += e.iter().map(|x| x * x).sum::<f64>() / n as f64;
+            mean += (e.iter().sum::<f64>() / n as f64).powi(2);
+        }
+        let (square, mean) = (square / f64::from(draws) / 0.01, mean / f64::from(draws) / 0.01);
+        assert!((square - 1.0).abs() < 0.05, "{square}");
+        assert!((mean * CONTOUR_MODES as f64 - 1.0).abs() < 0.1, "{mean}");
+    }
+}
