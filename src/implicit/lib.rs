@@ -4,22 +4,31 @@
 //! planar curves -> constraints -> (K + D) c + P b = y -> f -> lattice values -> Gaussian within one pixel -> smoothed f
 //! ```
 
+mod conjugate;
 mod constraints;
+mod contrasts;
 mod error;
 mod field;
 mod fit;
+mod interpolate;
 mod kernel;
+mod nearest;
+mod product;
+mod roughness;
 mod sampled;
 mod settings;
 mod smooth;
 mod system;
 #[cfg(test)]
 mod test_fields;
+mod variational;
 
 pub use constraints::Constraints;
 pub use error::Error;
 pub use field::{Field, foot};
-pub use fit::{FitReport, Variational, fit};
+pub use fit::{FitReport, fit};
+pub use interpolate::{SolveReport, interpolant};
 pub use sampled::{Sampled, SampledSettings};
-pub use settings::Settings;
+pub use settings::{Method, Settings};
 pub use smooth::{SmoothReport, Smoothing, smooth};
+pub use variational::Variational;
