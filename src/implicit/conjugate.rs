@@ -47,16 +47,17 @@ impl<'a> Iterative<'a> {
         Ok(Self { points, noise, reflections, contrasts, product: Product::new(points, noise) })
     }
 
-    /// Coefficients whose largest true residual is at most `tolerance` (in the unit of y).
+    /// Coefficients whose largest true residual is at most `tolerance` (in the unit of y), or what rounding lets it come
+    /// to, at most `limit`.
     ///
     /// # Errors
     /// [`Error::Stalled`], [`Error::Cancelled`].
-    pub(crate) fn solve(&self, y: &[f64], tolerance: f64, ctx: &Ctx) -> Result<Solution, Error> {
+    pub(crate) fn solve(&self, y: &[f64], [tolerance, limit]: [f64; 2], ctx: &Ctx) -> Result<Solution, Error> {
         let n = y.len();
         let mut c = vec![0.0; n];
         let mut errors = y.to_vec();
         let mut iterations = 0;
-        for _ in 0..ROUNDS {
+        for round in 1..=ROUNDS {
             let (step, count) = self.round(&errors, 0.5 * tolerance, ctx)?;
             iterations += count;
             c.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
@@ -66,12 +67,12 @@ impl<'a> Iterative<'a> {
             let b = self.reflections.polynomial(self.reflections.projected(&left).1);
             errors =
                 left.iter().zip(self.points).map(|(l, p)| l - b[0] - b[1] * p[0] - b[2] * p[1] - b[3] * p[2]).collect();
-            if largest(&errors) <= tolerance {
+            if largest(&errors) <= if round == ROUNDS { limit } else { tolerance } {
                 let condition = self.condition(ctx)?;
                 return Ok(Solution { coefficients: c, polynomial: b, errors, iterations, condition });
             }
         }
-        Err(Error::Stalled { constraints: n, iterations, residual_mm: largest(&errors), wanted_mm: tolerance })
+        Err(Error::Stalled { constraints: n, iterations, residual_mm: largest(&errors), wanted_mm: limit })
     }
 
     /// Conjugate gradients for right-hand side `y` from zero, until the recursion's residual is small or the iterations
@@ -165,7 +166,7 @@ mod tests {
         for (n, turn) in [(400, 0.0), (1040, 0.0), (2000, 0.6)] {
             let (points, noise, y) = vessel(n, turn);
             let (c, b) = Factor::new(&points, &noise, &ctx).unwrap().solve(&y);
-            let found = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, 1e-10, &ctx).unwrap();
+            let found = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, [1e-10; 2], &ctx).unwrap();
             let norm = dot(&c, &c).sqrt();
             let off: f64 = c.iter().zip(&found.coefficients).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
             assert!(off < 1e-6 * norm, "{n}: {:e} after {} iterations", off / norm, found.iterations);
@@ -182,7 +183,7 @@ mod tests {
         let (points, noise, y) = vessel(1200, 0.3);
         let solve = |threads| {
             let ctx = Ctx::new(threads).unwrap();
-            Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, 1e-9, &ctx).unwrap()
+            Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, [1e-9; 2], &ctx).unwrap()
         };
         let one = solve(1);
         for threads in [2, 3] {
@@ -198,10 +199,10 @@ mod tests {
         let (mut points, noise, y) = vessel(800, 0.0);
         points[7] = points[6];
         points[9] = points[8].map(|x| x + 1e-13);
-        let found = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, 1e-9, &ctx).unwrap();
+        let found = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, [1e-9; 2], &ctx).unwrap();
         assert!(largest(&found.errors) <= 1e-9);
         let exact = vec![0.0; points.len()];
-        let outcome = Iterative::new(&points, &exact, &ctx).and_then(|s| s.solve(&y, 1e-9, &ctx));
+        let outcome = Iterative::new(&points, &exact, &ctx).and_then(|s| s.solve(&y, [1e-9; 2], &ctx));
         assert!(
             matches!(outcome, Err(Error::Singular { .. } | Error::Stalled { .. })),
             "{:?}",
@@ -213,7 +214,7 @@ mod tests {
     fn a_wish_beyond_rounding_is_a_stall() {
         let ctx = Ctx::new(1).unwrap();
         let (points, noise, y) = vessel(400, 0.0);
-        let outcome = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, 1e-30, &ctx);
+        let outcome = Iterative::new(&points, &noise, &ctx).unwrap().solve(&y, [1e-30; 2], &ctx);
         assert!(matches!(outcome, Err(Error::Stalled { .. })));
     }
 
@@ -223,7 +224,7 @@ mod tests {
         let ctx = Ctx::new(1).unwrap();
         let system = Iterative::new(&points, &noise, &ctx).unwrap();
         ctx.cancel();
-        assert!(matches!(system.solve(&y, 1e-9, &ctx), Err(Error::Cancelled)));
+        assert!(matches!(system.solve(&y, [1e-9; 2], &ctx), Err(Error::Cancelled)));
         assert!(matches!(Iterative::new(&points, &noise, &ctx), Err(Error::Cancelled)));
     }
 }

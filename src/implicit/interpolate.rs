@@ -19,8 +19,8 @@ pub(crate) struct Problem<'a> {
     pub(crate) noise: &'a [f64],
     /// y.
     pub(crate) values: &'a [f64],
-    /// Largest true residual wanted, in the unit of y.
-    pub(crate) tolerance: f64,
+    /// Largest true residual wanted and largest that is accepted where rounding allows no better, in the unit of y.
+    pub(crate) tolerance: [f64; 2],
 }
 
 /// The solution by the method asked for.
@@ -87,7 +87,7 @@ pub fn interpolant(
 ) -> Result<(Variational, SolveReport), Error> {
     let scale = Scale::of(points);
     let scaled: Vec<[f64; 3]> = points.iter().map(|&p| scale.apply(p)).collect();
-    let solution = solved(&Problem { points: &scaled, noise, values, tolerance }, method, ctx)?;
+    let solution = solved(&Problem { points: &scaled, noise, values, tolerance: [tolerance; 2] }, method, ctx)?;
     let report = SolveReport {
         iterations: solution.iterations,
         residual_max: solution.errors.iter().fold(0.0, |m, r| m.max(r.abs())),
