@@ -1,5 +1,6 @@
 //! The outcome of imaging: planar smooth closed curves in patient space, with what is known about their ends.
 
+use crate::Blur;
 use crate::spline::PeriodicSpline;
 use space::{P3, V3};
 
@@ -126,6 +127,8 @@ pub struct Contours {
     pub pixel_mm: f64,
     /// Slice thickness of the acquisition where known.
     pub thickness_mm: Option<f64>,
+    /// The blur by which the curves were corrected in their planes; `None`: they are as drawn.
+    pub blur: Option<Blur>,
 }
 
 impl Curve {

@@ -2,6 +2,7 @@
 //!
 //! [`contours()`] is the whole; [`segment()`] its first half. Lumens are brighter than their surroundings.
 
+mod blur;
 mod candidate;
 mod contours;
 mod curve;
@@ -20,6 +21,7 @@ mod track;
 mod trials;
 mod volume;
 
+pub use blur::Blur;
 pub use contours::{Report, contours};
 pub use curve::{Axis, Contours, Curve, CurvePoint, CutPlane, Plane, Tip};
 pub use error::Error;

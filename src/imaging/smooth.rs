@@ -6,6 +6,7 @@
 //! The half-maximum contour of a blurred convex lumen lies inside the wall: each point is moved outward by
 //! kappa/2 det(Sigma)/(n' Sigma n), which is kappa/2 (sigma^2 + px^2/12) for square pixels.
 
+use crate::blur::half_maximum_shift;
 use crate::march::Line;
 use crate::spline::{PeriodicSpline, basis};
 
@@ -215,11 +216,7 @@ pub(crate) fn corrected(spline: &PeriodicSpline, variance: [f64; 2]) -> Periodic
             // outward: to the right of the direction of travel
             let n = [d[1] / speed, -d[0] / speed];
             let kappa = (d[0] * dd[1] - d[1] * dd[0]) / speed.powi(3);
-            let along = variance[0] * n[0] * n[0] + variance[1] * n[1] * n[1];
-            let across = variance[0] * variance[1] / along.max(f64::MIN_POSITIVE);
-            // the expansion holds while the radius of curvature passes the blur
-            let limit = 0.5 * across.sqrt();
-            let shift = (0.5 * kappa * across).clamp(-limit, limit);
+            let shift = half_maximum_shift(kappa, n, variance);
             [p[0] + shift * n[0], p[1] + shift * n[1]]
         })
         .collect();

@@ -27,10 +27,15 @@ pub struct Constraints {
     pub interior: Vec<(usize, f64)>,
     /// For each wall constraint the curve it was taken from; `None` for a tip.
     pub curve: Vec<Option<usize>>,
+    /// For each wall constraint how far its contour was moved by the planar half-maximum correction, mm outward in the
+    /// plane; `None` where no other correction may take its place (tips, end planes, no known blur).
+    pub planar_shift: Vec<Option<V3>>,
 }
 
 /// Fewest wall points per curve: a cubic radial basis needs about this many to carry an ellipse.
 const LEAST_PER_CURVE: f64 = 10.0;
+/// Most wall points per curve: a circle of 48 points is met to 1e-4 of its radius, so that a wide lumen needs no more.
+const MOST_PER_CURVE: f64 = 48.0;
 /// Golden ratio: shifts the first point from plane to plane so that neighbours interleave.
 const GOLDEN: f64 = 0.618_033_988_749_895;
 /// Relative error granted to interior values in the first pass, whose normals are only planar: at 45 degrees between
@@ -47,6 +52,7 @@ struct WallPoint {
     width_mm: f64,
     sigma_mm: f64,
     curve: usize,
+    planar_shift: Option<V3>,
 }
 
 /// First pass: normals are those of the planar curves.
@@ -58,6 +64,7 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.values.push(0.0);
         c.sigma_mm.push(w.sigma_mm);
         c.curve.push(Some(w.curve));
+        c.planar_shift.push(w.planar_shift);
     }
     push_tips(contours, &mut c);
     for (i, w) in wall.iter().enumerate() {
@@ -71,25 +78,28 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
     c
 }
 
-/// Second pass: the same wall, interior points along the three-dimensional normals of the first function.
+/// Second pass: the wall at `wall` (moved by the spatial correction), interior points along the three-dimensional normals
+/// of the first function.
 ///
 /// `normal(x)` gives the unit inward normal at a wall point, `inside(x)` whether a point is in the lumen.
 pub(crate) fn spatial(
     first: &Constraints,
+    wall: Vec<P3>,
     normal: impl Fn(P3) -> Option<V3>,
     inside: impl Fn(P3) -> bool,
 ) -> Constraints {
     let mut c = Constraints {
-        points: first.points[..first.wall].to_vec(),
+        points: wall,
         values: first.values[..first.wall].to_vec(),
         sigma_mm: first.sigma_mm[..first.wall].to_vec(),
         wall: first.wall,
         interior: Vec::new(),
         curve: first.curve.clone(),
+        planar_shift: first.planar_shift.clone(),
     };
     for (k, &(i, planar_offset)) in first.interior.iter().enumerate() {
-        let x = first.points[i];
-        let Some(n) = normal(x) else { continue };
+        let x = c.points[i];
+        let Some(n) = normal(first.points[i]) else { continue };
         // the inside check: twice the offset must still be lumen, else the offset passes the medial surface
         let mut offset = planar_offset;
         while offset > 0.1 * planar_offset && !inside(x + n * (2.0 * offset)) {
@@ -117,7 +127,7 @@ fn offset(width_mm: f64, settings: &Settings) -> f64 {
 
 /// Wall points of all curves; the step between them grows until all constraints fit under the limit.
 fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
-    let finest = contours.pixel_mm.max(0.5 * plane_spacing_mm(contours));
+    let finest = settings.step * contours.pixel_mm.max(0.5 * plane_spacing_mm(contours));
     // one interior point per wall point, and room for tips and closing points
     let room = settings.max_constraints.saturating_sub(64 + 2 * contours.tips.len()) / 2;
     let (mut step, mut stride) = (finest, 1);
@@ -151,7 +161,7 @@ fn plane_spacing_mm(contours: &Contours) -> f64 {
 }
 
 fn count_on(curve: &Curve, step: f64) -> usize {
-    (curve.length_mm() / step).ceil().max(LEAST_PER_CURVE) as usize
+    (curve.length_mm() / step).ceil().clamp(LEAST_PER_CURVE, MOST_PER_CURVE) as usize
 }
 
 /// Points of one curve, denser where it bends: density = (1 + |kappa| R) / 2 with R = length / 2 pi, so that a circle
@@ -171,6 +181,11 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
     let count = count_on(curve, step);
     let phase = (GOLDEN * curve.plane as f64).fract();
     let polygons = polygons(contours, curve.plane);
+    // at the end planes the first function already closes: its bend along the vessel is not the wall's
+    let at_end = contours.cuts.iter().any(|cut| {
+        cut.outward.dot(plane.normal()).abs() > 0.999
+            && (plane.origin - cut.point).dot(cut.outward).abs() < 1e-3 * contours.pixel_mm
+    });
     let mut out = Vec::with_capacity(count);
     let mut k = 0;
     for i in 0..count {
@@ -189,6 +204,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
             width_mm: width(plane, &polygons, p.position, p.inward).unwrap_or(2.0 * radius),
             sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
             curve: number,
+            planar_shift: contours.blur.filter(|_| !at_end).map(|b| p.inward * -b.planar_shift_mm(plane, &p)),
         });
     }
     out
@@ -246,6 +262,7 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
         c.values.push(0.0);
         c.sigma_mm.push(0.5 * contours.pixel_mm);
         c.curve.push(None);
+        c.planar_shift.push(None);
         c.wall += 1;
     }
 }

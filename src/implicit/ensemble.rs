@@ -3,7 +3,7 @@
 //! The fit is the posterior mean of a random field with generalised covariance s |x - x'|^3 under the constraints' noise
 //! (see [`crate::fit`]). A draw from that posterior differs from the mean by g - fit(g(x_i) + e_i), where g is a draw of
 //! the field itself and e_i one of the noise (Matheron's rule; Chiles and Delfiner 2012, 7.3): bands widen where slices
-//! are far apart, because there g is not tied down. It takes one more solve with the same factor per draw, and nothing
+//! are far apart, because there g is not tied down. It takes one more solve with the same prepared system per draw, and nothing
 //! is assumed of the solver but that it solves for any right-hand side. Perturbing the wall alone (e without g) was
 //! rejected: it says that the shape between two slices is known exactly.
 //!
@@ -14,8 +14,9 @@
 
 use crate::Error;
 use crate::constraints::Constraints;
+use crate::interpolate::Solver;
 use crate::kernel::Centres;
-use crate::system::{Factor, Scale};
+use crate::system::Scale;
 use exec::Ctx;
 use space::P3;
 
@@ -27,6 +28,8 @@ const WAVES: usize = 256;
 /// Smallest wave number, in scaled coordinates (the farthest constraint at distance 1): what is longer is as good as a
 /// polynomial of second degree, which the constraints determine.
 const WAVE_NUMBER_MIN: f64 = 0.5;
+/// Largest residual wanted and accepted of a draw, mm: bands are some hundredths of a mm wide.
+const DRAW_MM: [f64; 2] = [1e-4, 1e-3];
 /// Wall points from which their spacing is estimated.
 const SPACING_SAMPLES: usize = 64;
 
@@ -61,16 +64,18 @@ struct Wave {
 }
 
 impl Ensemble {
-    /// `count` draws for a factorised fit with scale `s` of the field. The same for any number of threads.
+    /// `count` draws for a solved fit with scale `s` of the field. The same for any number of threads.
     pub(crate) fn new(
         c: &Constraints,
-        factor: &Factor,
+        solver: &Solver<'_>,
         (scale, s): (Scale, f64),
         count: usize,
         ctx: &Ctx,
     ) -> Result<Self, Error> {
         let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
         let longest = 2.0 * std::f64::consts::TAU / spacing(&points[..c.wall]).max(1e-4);
+        // the solver tells a progress of its own for every draw
+        let quiet = ctx.part(0.0, 0.0);
         let draw = |number: usize| {
             let mut normal = Normal::new(number as u64);
             let waves = waves(s, longest.max(2.0 * WAVE_NUMBER_MIN), &mut normal);
@@ -78,10 +83,11 @@ impl Ensemble {
             for (v, p) in values.iter_mut().zip(&points) {
                 *v += sum(&waves, *p);
             }
-            let (coefficients, polynomial) = factor.solve(&values);
-            Draw { waves, centres: Centres::new(&points, &coefficients), polynomial }
+            let solution = solver.solve(&values, DRAW_MM, &quiet)?;
+            Ok(Draw { waves, centres: Centres::new(&points, &solution.coefficients), polynomial: solution.polynomial })
         };
-        Ok(Self { draws: ctx.map_range(count, draw)?, scale: Some(scale) })
+        let draws = ctx.map_range(count, draw)?.into_iter().collect::<Result<Vec<_>, Error>>()?;
+        Ok(Self { draws, scale: Some(scale) })
     }
 }
 
@@ -228,6 +234,7 @@ mod tests {
             sigma_mm: vec![0.1; n],
             wall: n,
             interior: Vec::new(),
+            planar_shift: vec![None; n],
             curve: vec![Some(0); n],
         };
         let draws = 3000;

@@ -37,6 +37,20 @@ pub enum Error {
         /// Row of the pivot that was not positive.
         pivot: usize,
     },
+    /// Conjugate gradients do not reach the accuracy wanted.
+    #[error(
+        "the system of {constraints} constraints is solved to {residual_mm:.1e} mm only, not to {wanted_mm:.1e} mm, after {iterations} iterations: look for contours drawn twice or at contradictory places"
+    )]
+    Stalled {
+        /// Constraints.
+        constraints: usize,
+        /// Products with the matrix.
+        iterations: usize,
+        /// Largest true residual reached.
+        residual_mm: f64,
+        /// Largest true residual allowed.
+        wanted_mm: f64,
+    },
     /// The function misses its own data by more than the data's error allows.
     #[error(
         "the function misses its constraints by up to {residual_mm:.2} mm, more than {bound_mm:.2} mm: the contours contradict each other"
@@ -73,7 +87,7 @@ impl Faulty for Error {
         match self {
             Self::TooFewPoints { .. } | Self::Coplanar { .. } => FaultKind::Input,
             Self::TooMany { .. } | Self::TooManySamples { .. } => FaultKind::Limit,
-            Self::Singular { .. } | Self::Residual { .. } => FaultKind::Numeric,
+            Self::Singular { .. } | Self::Stalled { .. } | Self::Residual { .. } => FaultKind::Numeric,
             Self::Cancelled => FaultKind::Cancelled,
         }
     }
@@ -83,6 +97,7 @@ impl Faulty for Error {
             Self::Coplanar { .. } => "implicit.coplanar",
             Self::TooMany { .. } => "implicit.too_many_constraints",
             Self::Singular { .. } => "implicit.singular",
+            Self::Stalled { .. } => "fit.stalled",
             Self::Residual { .. } => "implicit.residual",
             Self::TooManySamples { .. } => "implicit.too_many_samples",
             Self::Cancelled => "cancelled",

@@ -7,7 +7,7 @@
 use pulp::Arch;
 
 /// Accumulators per sum. 8 doubles fill two AVX2 registers, which hides the latency of the addition.
-const LANES: usize = 8;
+pub(crate) const LANES: usize = 8;
 
 /// Centres and coefficients of a cubic radial sum.
 #[derive(Clone, Debug, Default)]
@@ -129,7 +129,7 @@ impl Centres {
 
 /// The lanes' sum in a fixed order.
 #[inline(always)]
-fn fold(a: [f64; LANES]) -> f64 {
+pub(crate) fn fold(a: [f64; LANES]) -> f64 {
     ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7]))
 }
 

@@ -4,24 +4,33 @@
 //! planar curves -> constraints -> (K + D) c + P b = y -> f -> lattice values -> Gaussian within one pixel -> smoothed f
 //! ```
 
+mod conjugate;
 mod constraints;
+mod contrasts;
 mod ensemble;
 mod error;
 mod field;
 mod fit;
+mod interpolate;
 mod kernel;
+mod nearest;
+mod product;
+mod roughness;
 mod sampled;
 mod settings;
 mod smooth;
 mod system;
 #[cfg(test)]
 mod test_fields;
+mod variational;
 
 pub use constraints::Constraints;
 pub use ensemble::{Draws, Ensemble};
 pub use error::Error;
 pub use field::{Field, foot};
-pub use fit::{FitReport, Variational, fit, fit_with_ensemble};
+pub use fit::{FitReport, fit, fit_with_ensemble};
+pub use interpolate::{SolveReport, interpolant};
 pub use sampled::{Sampled, SampledSettings};
-pub use settings::Settings;
+pub use settings::{Method, Settings};
 pub use smooth::{SmoothReport, Smoothing, smooth};
+pub use variational::Variational;

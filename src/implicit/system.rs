@@ -43,7 +43,7 @@ impl Scale {
 }
 
 /// Householder reflections that annihilate P below its first four rows, and R.
-struct Reflections {
+pub(crate) struct Reflections {
     v: [Vec<f64>; 4],
     tau: [f64; 4],
     r: [[f64; 4]; 4],
@@ -74,18 +74,51 @@ impl Reflections {
         out
     }
 
+    /// The reflections of points that span space.
+    ///
+    /// # Errors
+    /// [`Error::Coplanar`].
+    pub(crate) fn spanning(points: &[[f64; 3]]) -> Result<Self, Error> {
+        let n = points.len();
+        let out = Self::of(points);
+        if n < 5 || out.spread(n) < 1e-6 {
+            return Err(Error::Coplanar { points: n });
+        }
+        Ok(out)
+    }
+
     /// y -> Q'y.
-    fn forward(&self, y: &mut [f64]) {
+    pub(crate) fn forward(&self, y: &mut [f64]) {
         for k in 0..4 {
             reflect(&self.v[k], self.tau[k], y);
         }
     }
 
     /// y -> Q y.
-    fn backward(&self, y: &mut [f64]) {
+    pub(crate) fn backward(&self, y: &mut [f64]) {
         for k in (0..4).rev() {
             reflect(&self.v[k], self.tau[k], y);
         }
+    }
+
+    /// b with R b = top.
+    pub(crate) fn polynomial(&self, top: [f64; 4]) -> [f64; 4] {
+        let mut b = [0.0; 4];
+        for k in (0..4).rev() {
+            let known = (k + 1..4).fold(0.0, |s, j| s + self.r[k][j] * b[j]);
+            b[k] = (top[k] - known) / self.r[k][k];
+        }
+        b
+    }
+
+    /// The part of y at a right angle to the columns of P, and Q1'y.
+    pub(crate) fn projected(&self, y: &[f64]) -> (Vec<f64>, [f64; 4]) {
+        let mut q = y.to_vec();
+        self.forward(&mut q);
+        let top = [q[0], q[1], q[2], q[3]];
+        q[..4].fill(0.0);
+        self.backward(&mut q);
+        (q, top)
     }
 
     /// Smallest |R_kk| over sqrt(n): 0 when the points lie in a plane.
@@ -102,7 +135,7 @@ fn reflect(v: &[f64], tau: f64, y: &mut [f64]) {
 }
 
 /// Inner product with eight independent accumulators (vectorises, fixed order).
-fn dot(a: &[f64], b: &[f64]) -> f64 {
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut acc = [0.0; 8];
     let (ca, cb) = (a.chunks_exact(8), b.chunks_exact(8));
     let tail = ca.remainder().iter().zip(cb.remainder()).fold(0.0, |s, (x, y)| s + x * y);
@@ -129,10 +162,7 @@ impl Factor {
     /// [`Error::Coplanar`], [`Error::Singular`], [`Error::Cancelled`].
     pub(crate) fn new(points: &[[f64; 3]], noise: &[f64], ctx: &Ctx) -> Result<Self, Error> {
         let n = points.len();
-        let reflections = Reflections::of(points);
-        if n < 5 || reflections.spread(n) < 1e-6 {
-            return Err(Error::Coplanar { points: n });
-        }
+        let reflections = Reflections::spanning(points)?;
         let mut matrix = vec![0.0; n * n];
         ctx.chunks_mut(&mut matrix, n, |first, column| {
             let j = first / n;
@@ -195,11 +225,7 @@ impl Factor {
                 *r -= self.matrix[(j + 4) * n + k] * uj;
             }
         }
-        let mut b = [0.0; 4];
-        for k in (0..4).rev() {
-            let known = (k + 1..4).fold(0.0, |s, j| s + self.reflections.r[k][j] * b[j]);
-            b[k] = (rhs[k] - known) / self.reflections.r[k][k];
-        }
+        let b = self.reflections.polynomial(rhs);
         let mut c = vec![0.0; 4];
         c.append(&mut u);
         self.reflections.backward(&mut c);

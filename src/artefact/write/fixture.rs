@@ -244,6 +244,7 @@ impl Fixture {
                 tips: vec![],
                 pixel_mm: 0.5,
                 thickness_mm: Some(1.5),
+                blur: None,
             },
             warnings: vec![warn(
                 "stack.gap",

@@ -1,0 +1,129 @@
+//! One linear system, solved by the method that fits its size; and the plain interpolant of scattered values.
+
+use crate::conjugate::{Iterative, Solution};
+use crate::system::{Factor, Scale, residual};
+use crate::variational::Variational;
+use crate::{Error, Method};
+use exec::Ctx;
+use space::P3;
+
+/// Up to here the dense factor is as fast as conjugate gradients, and it is the oracle.
+const DENSE: usize = 1000;
+/// Up to here the dense factor (512 MB, 6 CPU-s) answers where conjugate gradients stall.
+const FALLBACK: usize = 8000;
+
+/// A system in scaled coordinates: (K + D) c + P b = y, P'c = 0.
+pub(crate) struct Problem<'a> {
+    pub(crate) points: &'a [[f64; 3]],
+    /// Diagonal of D.
+    pub(crate) noise: &'a [f64],
+    /// y.
+    pub(crate) values: &'a [f64],
+    /// Largest true residual wanted and largest that is accepted where rounding allows no better, in the unit of y.
+    pub(crate) tolerance: [f64; 2],
+}
+
+/// A prepared system: solves for any right-hand side.
+pub(crate) enum Solver<'a> {
+    Dense { factor: Box<Factor>, points: &'a [[f64; 3]], noise: &'a [f64] },
+    Iterative(Box<Iterative<'a>>),
+}
+
+impl<'a> Solver<'a> {
+    fn dense(problem: &Problem<'a>, ctx: &Ctx) -> Result<Self, Error> {
+        let factor = Box::new(Factor::new(problem.points, problem.noise, ctx)?);
+        Ok(Self::Dense { factor, points: problem.points, noise: problem.noise })
+    }
+
+    fn iterative(problem: &Problem<'a>, ctx: &Ctx) -> Result<Self, Error> {
+        Ok(Self::Iterative(Box::new(Iterative::new(problem.points, problem.noise, ctx)?)))
+    }
+
+    /// Solve for the values y. `tolerance` as in [`Problem`]; the dense factor always gives all that rounding allows.
+    ///
+    /// # Errors
+    /// [`Error::Stalled`], [`Error::Cancelled`].
+    pub(crate) fn solve(&self, values: &[f64], tolerance: [f64; 2], ctx: &Ctx) -> Result<Solution, Error> {
+        match self {
+            Self::Iterative(system) => system.solve(values, tolerance, ctx),
+            Self::Dense { factor, points, noise } => refined(factor, points, (noise, values), ctx),
+        }
+    }
+}
+
+/// The solution by the method asked for, and what it was solved with.
+///
+/// # Errors
+/// [`Error::Coplanar`], [`Error::Singular`], [`Error::Stalled`], [`Error::Cancelled`].
+pub(crate) fn solved<'a>(problem: &Problem<'a>, method: Method, ctx: &Ctx) -> Result<(Solution, Solver<'a>), Error> {
+    let n = problem.points.len();
+    let by = |solver: Result<Solver<'a>, Error>, ctx: &Ctx| {
+        let solver = solver?;
+        Ok((solver.solve(problem.values, problem.tolerance, ctx)?, solver))
+    };
+    let dense = || by(Solver::dense(problem, &ctx.part(0.0, 0.9)), &ctx.part(0.9, 1.0));
+    let iterative = || by(Solver::iterative(problem, &ctx.part(0.0, 0.3)), &ctx.part(0.3, 1.0));
+    match method {
+        Method::Dense => dense(),
+        Method::Iterative => iterative(),
+        Method::BySize if n <= DENSE => dense(),
+        Method::BySize => match iterative() {
+            Err(Error::Stalled { .. } | Error::Singular { .. }) if n <= FALLBACK => dense(),
+            outcome => outcome,
+        },
+    }
+}
+
+/// The factor's solution after one step of refinement: the factor's own rounding is the largest error left.
+fn refined(
+    factor: &Factor,
+    points: &[[f64; 3]],
+    (noise, values): (&[f64], &[f64]),
+    ctx: &Ctx,
+) -> Result<Solution, Error> {
+    let (mut coefficients, mut polynomial) = factor.solve(values);
+    let r = residual(points, noise, values, (&coefficients, &polynomial), ctx)?;
+    let (dc, db) = factor.solve(&r);
+    coefficients.iter_mut().zip(&dc).for_each(|(c, d)| *c += d);
+    polynomial.iter_mut().zip(&db).for_each(|(b, d)| *b += d);
+    let errors = residual(points, noise, values, (&coefficients, &polynomial), ctx)?;
+    ctx.progress(1.0);
+    Ok(Solution { coefficients, polynomial, errors, iterations: 0, condition: factor.condition() })
+}
+
+/// What a solution says of itself.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SolveReport {
+    /// Iterations of conjugate gradients, 0 of the dense factor.
+    pub iterations: usize,
+    /// Largest residual of the system by a sum of its own, in the unit of the values.
+    pub residual_max: f64,
+    /// Estimated 2-norm condition of the projected system.
+    pub condition: f64,
+    /// Coefficients c_i in scaled coordinates (the farthest point at distance 1).
+    pub coefficients: Vec<f64>,
+}
+
+/// The function through scattered values: f(x_i) + noise_i c_i = y_i, with noise in units of the kernel in scaled
+/// coordinates (the farthest point from the mean at distance 1), to a largest true residual of `tolerance`.
+///
+/// # Errors
+/// [`Error::Coplanar`], [`Error::Singular`], [`Error::Stalled`], [`Error::Cancelled`].
+pub fn interpolant(
+    points: &[P3],
+    (values, noise): (&[f64], &[f64]),
+    tolerance: f64,
+    method: Method,
+    ctx: &Ctx,
+) -> Result<(Variational, SolveReport), Error> {
+    let scale = Scale::of(points);
+    let scaled: Vec<[f64; 3]> = points.iter().map(|&p| scale.apply(p)).collect();
+    let (solution, _) = solved(&Problem { points: &scaled, noise, values, tolerance: [tolerance; 2] }, method, ctx)?;
+    let report = SolveReport {
+        iterations: solution.iterations,
+        residual_max: solution.errors.iter().fold(0.0, |m, r| m.max(r.abs())),
+        condition: solution.condition,
+        coefficients: solution.coefficients.clone(),
+    };
+    Ok((Variational::new(points.to_vec(), scale, &solution)?, report))
+}

@@ -1,0 +1,146 @@
+//! The symmetric product (K + D) c with K_ij = |x_i - x_j|^3, matrix-free: every pair's root is taken once.
+//!
+//! Points lie in tiles of [`TILE`]; a pair of tiles adds to both sides. Tiles are dealt to a fixed number of tasks, each
+//! with sums of its own that are folded in order, so the bits do not depend on the number of threads. Half the roots of
+//! the plain sum, and the root is what limits both.
+
+use crate::kernel::LANES;
+use exec::{Cancelled, Ctx};
+use pulp::Arch;
+
+/// Points per tile: positions, coefficients and sums of one tile are 10 KiB, a third of the first cache.
+const TILE: usize = 256;
+const GROUPS: usize = TILE / LANES;
+/// Tasks, fixed: also the number of partial sums per point (256 bytes per unknown).
+const TASKS: usize = 32;
+
+type Lanes = [f64; LANES];
+
+/// Points and noise, ready for products.
+pub(crate) struct Product {
+    n: usize,
+    position: Vec<[Lanes; 3]>,
+    noise: Vec<f64>,
+}
+
+impl Product {
+    pub(crate) fn new(points: &[[f64; 3]], noise: &[f64]) -> Self {
+        let n = points.len();
+        let mut position = vec![[[0.0; LANES]; 3]; n.div_ceil(TILE) * GROUPS];
+        for (i, p) in points.iter().enumerate() {
+            for a in 0..3 {
+                position[i / LANES][a][i % LANES] = p[a];
+            }
+        }
+        Self { n, position, noise: noise.to_vec() }
+    }
+
+    /// (K + D) c. Cost: n^2 / 2 roots.
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub(crate) fn times(&self, c: &[f64], ctx: &Ctx) -> Result<Vec<f64>, Cancelled> {
+        let tiles = self.position.len() / GROUPS;
+        let mut packed = vec![[0.0; LANES]; self.position.len()];
+        c.iter().enumerate().for_each(|(i, c)| packed[i / LANES][i % LANES] = *c);
+        let tasks = TASKS.min(tiles);
+        let parts = ctx.map_range(tasks, |task| {
+            let mut sums = vec![[0.0; LANES]; packed.len()];
+            let mine = |row: &usize| [task, 2 * tasks - 1 - task].contains(&(row % (2 * tasks)));
+            for row in (0..tiles).filter(mine) {
+                ctx.check()?;
+                Arch::new().dispatch(|| self.tile_row(row, &packed, &mut sums));
+            }
+            Ok(sums)
+        })?;
+        let parts: Vec<Vec<Lanes>> = parts.into_iter().collect::<Result<_, Cancelled>>()?;
+        let mut out = vec![0.0; self.n];
+        ctx.chunks_mut(&mut out, TILE, |first, chunk| {
+            for (k, o) in chunk.iter_mut().enumerate() {
+                let i = first + k;
+                *o = parts.iter().fold(self.noise[i] * c[i], |s, p| s + p[i / LANES][i % LANES]);
+            }
+        })?;
+        Ok(out)
+    }
+
+    /// All pairs of a tile with itself and with the tiles after it.
+    #[inline(always)]
+    fn tile_row(&self, row: usize, c: &[Lanes], sums: &mut [Lanes]) {
+        let own = row * GROUPS;
+        let targets = own * LANES..((own + GROUPS) * LANES).min(self.n);
+        let at = |i: usize| [0, 1, 2].map(|a| self.position[i / LANES][a][i % LANES]);
+        for i in targets.clone() {
+            // within the tile every pair is met from both sides
+            let within = one_sided(&self.position[own..own + GROUPS], at(i), &c[own..own + GROUPS]);
+            sums[i / LANES][i % LANES] += within;
+        }
+        for other in (own + GROUPS..self.position.len()).step_by(GROUPS) {
+            let theirs = other..other + GROUPS;
+            for i in targets.clone() {
+                let (g, l) = (i / LANES, i % LANES);
+                let tile = (&self.position[theirs.clone()], &c[theirs.clone()]);
+                sums[g][l] += two_sided(tile, at(i), c[g][l], &mut sums[theirs.clone()]);
+            }
+        }
+    }
+}
+
+/// sum c_j r_j^3 over a few groups.
+#[inline(always)]
+fn one_sided(position: &[[Lanes; 3]], t: [f64; 3], c: &[Lanes]) -> f64 {
+    let mut acc = [0.0; LANES];
+    for ([x, y, z], c) in position.iter().zip(c) {
+        for l in 0..LANES {
+            let d = [t[0] - x[l], t[1] - y[l], t[2] - z[l]];
+            let r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            acc[l] += c[l] * (r2 * r2.sqrt());
+        }
+    }
+    crate::kernel::fold(acc)
+}
+
+/// The same, which also adds own r_j^3 to every `sums` j.
+#[inline(always)]
+fn two_sided((position, c): (&[[Lanes; 3]], &[Lanes]), t: [f64; 3], own: f64, sums: &mut [Lanes]) -> f64 {
+    let mut acc = [0.0; LANES];
+    for (([x, y, z], c), sum) in position.iter().zip(c).zip(sums) {
+        for l in 0..LANES {
+            let d = [t[0] - x[l], t[1] - y[l], t[2] - z[l]];
+            let r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            let cube = r2 * r2.sqrt();
+            acc[l] += c[l] * cube;
+            sum[l] += own * cube;
+        }
+    }
+    crate::kernel::fold(acc)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_product_is_the_plain_sum_with_the_same_bits_for_any_thread_count() {
+        for n in [1, 7, 256, 257, 3000] {
+            let f = |i: usize, a: f64| ((i as f64 * a).sin() * 43_758.545).fract();
+            let points: Vec<[f64; 3]> = (0..n).map(|i| [f(i + 1, 12.98), f(i + 1, 78.23), f(i + 1, 37.72)]).collect();
+            let c: Vec<f64> = (0..n).map(|i| f(i, 3.3)).collect();
+            let noise = vec![0.25; n];
+            let product = Product::new(&points, &noise);
+            let out = product.times(&c, &Ctx::new(1).unwrap()).unwrap();
+            for (i, o) in out.iter().enumerate().step_by(17) {
+                let plain = points
+                    .iter()
+                    .zip(&c)
+                    .fold(0.25 * c[i], |s, (p, c)| s + c * crate::nearest::distance2(p, &points[i]).powf(1.5));
+                assert!((o - plain).abs() < 1e-11 * (1.0 + n as f64), "{o} {plain}");
+            }
+            for threads in [2, 3] {
+                let other = product.times(&c, &Ctx::new(threads).unwrap()).unwrap();
+                assert!(out.iter().zip(&other).all(|(a, b)| a.to_bits() == b.to_bits()));
+            }
+        }
+    }
+}
