@@ -2,7 +2,8 @@
 
 use crate::draw::{Drawn, Frame, Outline, axis, drawn, planes};
 use crate::march::Line;
-use crate::segment::{Segmentation, Vessel, segment};
+use crate::segment::{Segmentation, Site, Vessel, segment};
+use crate::shape::{Shape, at_border};
 use crate::smooth::{Profile, Smoothed, blur, corrected, smoothed};
 use crate::spline::PeriodicSpline;
 use crate::track::ends;
@@ -69,7 +70,12 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
     let s = segment(stack, settings, &ctx.part(0.0, 0.7))?;
     let axis = settings.axis.unwrap_or_else(|| axis(stack, &s));
     let planes = planes(stack, axis);
-    let drawn = drawn(stack, &s, axis, ctx)?;
+    let mut drawn = drawn(stack, &s, axis, ctx)?;
+    let mut warnings = stack.gap_warnings();
+    warnings.extend(s.warnings.iter().cloned());
+    warnings.extend(Shape::new(stack, axis, &planes, s.low, &drawn).without_pieces(&mut drawn));
+    warnings.extend(Shape::new(stack, axis, &planes, s.low, &drawn).warnings(&drawn, ctx)?);
+    warnings.extend(at_border(axis, &drawn, &planes));
     ctx.progress(0.8);
     let shown = drawn.iter().filter(|d| !d.outlines.is_empty()).count();
     if shown < 3 {
@@ -79,8 +85,6 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
         drawn.iter().enumerate().flat_map(|(k, d)| (0..d.outlines.len()).map(move |o| (k, o))).collect();
     let smooth = ctx.map(&outlines, |&(k, o)| smoothed(&drawn[k].outlines[o].line))?;
     ctx.progress(0.9);
-    let mut warnings = stack.gap_warnings();
-    warnings.extend(s.warnings.iter().cloned());
     let sigma_mm = match settings.psf_sigma_px {
         Some(px) => Some(px * stack.pixel_mm()),
         None => psf(&Sheets { stack, s: &s, axis, drawn: &drawn, planes: &planes }, &outlines, &smooth, ctx)?,
@@ -258,9 +262,13 @@ fn profiles(
     for j in (0..h).filter(|j| (low[1]..high[1]).contains(&plane.v_mm[v0 + j])) {
         for i in (0..w).filter(|i| (low[0]..high[0]).contains(&plane.u_mm[u0 + i])) {
             let p = [plane.u_mm[u0 + i], plane.v_mm[v0 + j]];
-            let off = |q: &[[f64; 2]; 3]| (q[0][0] - p[0]).hypot(q[0][1] - p[1]);
+            let at = frame.index(s, i, j, k);
+            if matches!(s.site[at], Site::Far) {
+                continue;
+            }
+            let off = |q: &[[f64; 2]; 3]| (q[0][0] - p[0]).powi(2) + (q[0][1] - p[1]).powi(2);
             let Some(near) = samples.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
-            if off(near) > reach {
+            if off(near) > reach * reach {
                 continue;
             }
             let [q, d, dd] = *near;
@@ -271,12 +279,9 @@ fn profiles(
             let along = (rel[0] * d[0] + rel[1] * d[1]) / speed;
             let kappa = (d[0] * dd[1] - d[1] * dd[0]) / speed.powi(3);
             let distance = rel[0] * inward[0] + rel[1] * inward[1] - 0.5 * kappa * along * along;
-            let at = frame.index(s, i, j, k);
             let contrast = f64::from(s.contrast[at]).max(f64::MIN_POSITIVE);
             let height = 0.5 + f64::from(Frame::grey(s, stack, at) - s.level[at]) / contrast;
-            if s.site[at] != crate::segment::Site::Far {
-                out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
-            }
+            out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
         }
     }
     out

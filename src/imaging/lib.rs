@@ -12,6 +12,7 @@ mod march;
 mod region;
 mod segment;
 mod settings;
+mod shape;
 mod smooth;
 mod spline;
 mod stack;
