@@ -126,11 +126,18 @@ fn lumens(drawn: &[Drawn]) -> Vec<(usize, usize)> {
     drawn.iter().filter_map(count).collect()
 }
 
-/// Blur variances along the plane's u and v, mm2: point spread and pixel within the slices; across them the thickness,
-/// or the step where no thickness is known.
+/// Linear interpolation between samples a step h apart draws a convex contour too small by kappa h^2 / 36: at the
+/// half-maximum the second derivative along the normal vanishes, so that along a lattice line f_xx = f' kappa sin^2, the
+/// crossing errs by t (1 - t) / 2 f_xx / f_x, and the mean over the crossings of all directions is kappa / 36. Written as
+/// a blur (kappa / 2 of its variance) that is h^2 / 18. Discs of 5 px at SNR 30 lose .43 % of area without it, .2 % with.
+const INTERPOLATION: f64 = 1.0 / 18.0;
+
+/// The planar half-maximum correction's blur variances along the plane's u and v, mm2: point spread and pixel within the
+/// slices; across them the thickness, or the step where no thickness is known; and what linear interpolation costs.
 fn variance(stack: &Stack, axis: Axis, sigma_mm: f64) -> [f64; 2] {
-    let pixel = sigma_mm.powi(2) + stack.pixel_mm().powi(2) / 12.0;
-    let across = stack.thickness_mm.unwrap_or(stack.slice_spacing_mm()).powi(2) / 12.0;
+    let step = stack.slice_spacing_mm();
+    let pixel = sigma_mm.powi(2) + stack.pixel_mm().powi(2) * (1.0 / 12.0 + INTERPOLATION);
+    let across = stack.thickness_mm.unwrap_or(step).powi(2) / 12.0 + step.powi(2) * INTERPOLATION;
     match axis {
         Axis::Slice => [pixel, pixel],
         Axis::Row => [across, pixel],

@@ -3,7 +3,8 @@
 //! A global level errs wherever coil sensitivity, inflow or the tissue around change: the half-way level between the
 //! lumen and its surroundings is taken at every voxel instead. Inside: raw grey values of the mask, weighted by the cube
 //! of their depth (up to 3 px), so that the blurred rim does not pull the value down. Outside: raw values 2 to 4 px away
-//! from the mask, those within 2 px of other bright structures left out. Both are spread by normalised convolution with
+//! from the mask; left out are those within 2 px of other bright structures, those into which the lumen runs on without a
+//! wall (docs/adr/0031), and what the mask encloses within a plane, a dim core of a wide lumen. Both are spread by normalised convolution with
 //! Gaussians of growing width, so that near data decide where there are any. The mask then grows (or shrinks) to the
 //! component above the level within reach, and the levels are taken anew until nothing changes: a vessel is followed as
 //! far as its own contrast carries it.

@@ -36,7 +36,7 @@ fn turned_tubes_keep_their_wall_on_near_isotropic_volumes() {
             );
             errors.push(o);
         }
-        // three pixels' worth of a disc's bar of .06 px
-        assert!(errors[0].rms_mm < 0.06 && errors[0].missed < 0.03, "{tilt_deg}");
+        // the bar of a disc of 5 px at SNR 20, .06 px
+        assert!(errors[0].rms_mm < 0.036 && errors[0].missed < 0.03, "{tilt_deg}");
     }
 }
