@@ -11,7 +11,7 @@
 //! mean step across the boundary over the mean height inside, largest at half height, so that a level at which
 //! neighbours melt together loses; position: 1 in the middle of the volume, .75 in its corners.
 
-use crate::region::{NEIGHBOURS, components, is_face, neighbour};
+use crate::region::{Around, NEIGHBOURS, components};
 use crate::volume::{Volume, quantile};
 use crate::{Error, Settings};
 use exec::Ctx;
@@ -152,18 +152,16 @@ fn measured(v: &Volume, level: f64, voxels: Vec<u32>, strict: bool, slots: &mut 
 fn boundary(v: &Volume, voxels: &[u32], slots: &[u32]) -> (f64, f64, f64) {
     let face = [v.step[1] * v.step[2], v.step[0] * v.step[2], v.step[0] * v.step[1]];
     let (mut area, mut step, mut height) = (0.0, 0.0, 0.0);
+    let around = Around::new(v.n);
     for &i in voxels {
         let i = i as usize;
         height += f64::from(v.data[i]);
-        for d in NEIGHBOURS.into_iter().filter(|&d| is_face(d)) {
-            let a = (0..3).find(|&a| d[a] != 0).unwrap_or(0);
-            if let Some(j) = neighbour(i, d, v.n)
-                && slots[j] == u32::MAX
-            {
+        around.visit_faces(i, |a, j| {
+            if slots[j] == u32::MAX {
                 area += face[a];
                 step += face[a] * f64::from(v.data[i] - v.data[j]);
             }
-        }
+        });
     }
     (area * std::f64::consts::FRAC_PI_4, step / area.max(1e-9), height / voxels.len() as f64)
 }
@@ -203,15 +201,14 @@ fn links(v: &Volume, voxels: &[u32], slots: &[u32]) -> Links {
         let l = (0..3).map(|a| (f64::from(d[a]) * v.step[a]).powi(2)).sum::<f64>().sqrt();
         (l / UNIT_MM).round().max(1.0) as u32
     });
+    let around = Around::new(v.n);
     let link = |&i: &u32| {
-        let mut out = Vec::new();
-        for (d, w) in NEIGHBOURS.into_iter().zip(weight) {
-            if let Some(j) = neighbour(i as usize, d, v.n)
-                && slots[j] != u32::MAX
-            {
-                out.push((slots[j], w));
+        let mut out = Vec::with_capacity(26);
+        around.visit(i as usize, |k, j| {
+            if slots[j] != u32::MAX {
+                out.push((slots[j], weight[k]));
             }
-        }
+        });
         out
     };
     voxels.iter().map(link).collect()

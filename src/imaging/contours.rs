@@ -3,7 +3,8 @@
 use crate::blur::Blur;
 use crate::draw::{Drawn, Frame, Outline, axis, drawn, planes};
 use crate::march::Line;
-use crate::segment::{Segmentation, Vessel, segment};
+use crate::segment::{Segmentation, Site, Vessel, segment};
+use crate::shape::{Shape, at_border};
 use crate::smooth::{Profile, Smoothed, blur, corrected, smoothed};
 use crate::spline::PeriodicSpline;
 use crate::track::ends;
@@ -70,7 +71,12 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
     let s = segment(stack, settings, &ctx.part(0.0, 0.7))?;
     let axis = settings.axis.unwrap_or_else(|| axis(stack, &s));
     let planes = planes(stack, axis);
-    let drawn = drawn(stack, &s, axis, ctx)?;
+    let mut drawn = drawn(stack, &s, axis, ctx)?;
+    let mut warnings = stack.gap_warnings();
+    warnings.extend(s.warnings.iter().cloned());
+    warnings.extend(Shape::new(stack, axis, &planes, s.low, &drawn).without_pieces(&mut drawn));
+    warnings.extend(Shape::new(stack, axis, &planes, s.low, &drawn).warnings(&drawn, ctx)?);
+    warnings.extend(at_border(axis, &drawn, &planes));
     ctx.progress(0.8);
     let shown = drawn.iter().filter(|d| !d.outlines.is_empty()).count();
     if shown < 3 {
@@ -80,8 +86,6 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
         drawn.iter().enumerate().flat_map(|(k, d)| (0..d.outlines.len()).map(move |o| (k, o))).collect();
     let smooth = ctx.map(&outlines, |&(k, o)| smoothed(&drawn[k].outlines[o].line))?;
     ctx.progress(0.9);
-    let mut warnings = stack.gap_warnings();
-    warnings.extend(s.warnings.iter().cloned());
     let sigma_mm = match settings.psf_sigma_px {
         Some(px) => Some(px * stack.pixel_mm()),
         None => psf(&Sheets { stack, s: &s, axis, drawn: &drawn, planes: &planes }, &outlines, &smooth, ctx)?,
@@ -100,7 +104,9 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
     let curves = ctx.map_range(outlines.len(), |i| {
         let (k, o) = outlines[i];
         let outline = &drawn[k].outlines[o];
-        curve(outline, &smooth[i], o, acquired.map(|b| b.in_plane(&planes[outline.plane])), stack)
+        let drawn_small = interpolation(stack, axis);
+        let variance = acquired.map(|b| b.in_plane(&planes[outline.plane]));
+        curve(outline, &smooth[i], o, variance.map(|v| [v[0] + drawn_small[0], v[1] + drawn_small[1]]), stack)
     })?;
     let ends = ends(stack, &s, axis, &drawn, &planes);
     warnings.extend(ends.warnings);
@@ -128,6 +134,24 @@ fn lumens(drawn: &[Drawn]) -> Vec<(usize, usize)> {
         Some((first.plane, d.outlines.iter().filter(|o| !o.hole).count()))
     };
     drawn.iter().filter_map(count).collect()
+}
+
+/// Linear interpolation between samples a step h apart draws a convex contour too small by kappa h^2 / 36: at the
+/// half-maximum the second derivative along the normal vanishes, so that along a lattice line f_xx = f' kappa sin^2, the
+/// crossing errs by t (1 - t) / 2 f_xx / f_x, and the mean over the crossings of all directions is kappa / 36. Written as
+/// a blur (kappa / 2 of its variance) that is h^2 / 18. Discs of 5 px at SNR 30 lose .43 % of area without it, .2 % with.
+const INTERPOLATION: f64 = 1.0 / 18.0;
+
+/// What is added to the blur variances along the plane's u and v for it, mm2. It is no blur of the acquisition, so the
+/// spatial correction leaves it where it is.
+fn interpolation(stack: &Stack, axis: Axis) -> [f64; 2] {
+    let pixel = stack.pixel_mm().powi(2) * INTERPOLATION;
+    let across = stack.slice_spacing_mm().powi(2) * INTERPOLATION;
+    match axis {
+        Axis::Slice => [pixel, pixel],
+        Axis::Row => [across, pixel],
+        Axis::Column => [pixel, across],
+    }
 }
 
 fn curve(outline: &Outline, fit: &Smoothed, lumen: usize, variance: Option<[f64; 2]>, stack: &Stack) -> Curve {
@@ -254,9 +278,13 @@ fn profiles(
     for j in (0..h).filter(|j| (low[1]..high[1]).contains(&plane.v_mm[v0 + j])) {
         for i in (0..w).filter(|i| (low[0]..high[0]).contains(&plane.u_mm[u0 + i])) {
             let p = [plane.u_mm[u0 + i], plane.v_mm[v0 + j]];
-            let off = |q: &[[f64; 2]; 3]| (q[0][0] - p[0]).hypot(q[0][1] - p[1]);
+            let at = frame.index(s, i, j, k);
+            if matches!(s.site[at], Site::Far) {
+                continue;
+            }
+            let off = |q: &[[f64; 2]; 3]| (q[0][0] - p[0]).powi(2) + (q[0][1] - p[1]).powi(2);
             let Some(near) = samples.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
-            if off(near) > reach {
+            if off(near) > reach * reach {
                 continue;
             }
             let [q, d, dd] = *near;
@@ -267,12 +295,9 @@ fn profiles(
             let along = (rel[0] * d[0] + rel[1] * d[1]) / speed;
             let kappa = (d[0] * dd[1] - d[1] * dd[0]) / speed.powi(3);
             let distance = rel[0] * inward[0] + rel[1] * inward[1] - 0.5 * kappa * along * along;
-            let at = frame.index(s, i, j, k);
             let contrast = f64::from(s.contrast[at]).max(f64::MIN_POSITIVE);
             let height = 0.5 + f64::from(Frame::grey(s, stack, at) - s.level[at]) / contrast;
-            if s.site[at] != crate::segment::Site::Far {
-                out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
-            }
+            out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
         }
     }
     out

@@ -17,10 +17,31 @@ pub(crate) struct Outline {
 /// One plane's lines and which lattice points of the segmentation's box they enclose.
 pub(crate) struct Drawn {
     pub(crate) outlines: Vec<Outline>,
+    /// Lattice points per line of `label`.
+    pub(crate) width: usize,
     /// Outlines that bound lumens (indices into `outlines`) have label index + 1; 0 elsewhere.
     pub(crate) label: Vec<u16>,
     /// Lines dropped as specks.
     pub(crate) specks: usize,
+}
+
+impl Drawn {
+    /// Removes outlines by their numbers; the others are numbered anew.
+    pub(crate) fn remove(&mut self, gone: &[usize]) {
+        if gone.is_empty() {
+            return;
+        }
+        let mut renamed = vec![0u16; self.outlines.len() + 1];
+        let kept = (0..self.outlines.len()).filter(|o| !gone.contains(o));
+        for (new, old) in kept.enumerate() {
+            renamed[old + 1] = new as u16 + 1;
+        }
+        for l in &mut self.label {
+            *l = renamed[usize::from(*l)];
+        }
+        let mut number = 0..;
+        self.outlines.retain(|_| !number.next().is_some_and(|n| gone.contains(&n)));
+    }
 }
 
 /// The lattice of an axis: which voxel steps are u, v and the plane's number.
@@ -158,7 +179,7 @@ fn plane_lines(stack: &Stack, s: &Segmentation, frame: Frame, plane: &Plane, k: 
             };
         }
     }
-    let mut out = Drawn { outlines: Vec::new(), label: vec![0; w * h], specks: 0 };
+    let mut out = Drawn { outlines: Vec::new(), width: w, label: vec![0; w * h], specks: 0 };
     if !any {
         return out;
     }

@@ -13,6 +13,7 @@ mod march;
 mod region;
 mod segment;
 mod settings;
+mod shape;
 mod smooth;
 mod spline;
 mod stack;

@@ -104,8 +104,7 @@ pub fn segment(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<Segmenta
         );
         return Err(Error::NoVessel { reason });
     };
-    let mut out = outlined(stack, settings, (&smooth, noise), &search, best, &ctx.part(0.5, 1.0))?;
-    out.noise = raw_noise;
+    let mut out = outlined(stack, settings, (&smooth, [raw_noise, noise]), &search, best, &ctx.part(0.5, 1.0))?;
     accepted(&out)?;
     out.candidates = found.iter().map(|c| vessel(stack, &search.flat, c, bin)).collect();
     ambiguity(&mut out, settings);
@@ -203,7 +202,7 @@ fn wanted(stack: &Stack, settings: &Settings, search: &Search, ctx: &Ctx) -> Res
 fn outlined(
     stack: &Stack,
     settings: &Settings,
-    (smooth, noise): (&Volume, f64),
+    (smooth, [raw_noise, noise]): (&Volume, [f64; 2]),
     search: &Search,
     best: &Candidate,
     ctx: &Ctx,
@@ -245,7 +244,7 @@ fn outlined(
             if grown.len() as f64 > LEAK * started as f64 {
                 warnings.push(leak(started, grown.len()));
             }
-            return Ok(finished(&patch, settings, &mask, fields, warnings));
+            return Ok(finished(&patch, settings, &mask, &fields, (raw_noise, warnings)));
         }
         seed = grown;
     }
@@ -321,10 +320,52 @@ fn touches(patch: &Patch, voxels: &[[usize; 3]], stack: &Stack) -> bool {
     })
 }
 
-fn finished(patch: &Patch, settings: &Settings, mask: &[bool], fields: Fields, warnings: Vec<Warning>) -> Segmentation {
+/// The half-way level of a magnitude image (Rician noise): its means lie above the true signal A, sqrt(A^2 + sigma^2) far
+/// from zero and 1.25 sigma at zero. The half is taken of the true signals and given its own mean: in black surroundings at
+/// SNR 8 the half of the plain means lies 6 % of the contrast too high, which is .1 px of the wall.
+fn half_level(inside: f64, outside: f64, sigma: f64) -> f64 {
+    // variance of a Rician variable in sigma^2: 2 - pi/2 at A = 0, 1 far from it
+    let variance = |a: f64| 1.0 - (std::f64::consts::FRAC_PI_2 - 1.0) * (-0.5 * (a / sigma).powi(2)).exp();
+    let signal =
+        |mean: f64| (0..5).fold(mean, |a, _| (mean * mean - sigma * sigma * (2.0 - variance(a))).max(0.0).sqrt());
+    let half = 0.5 * (signal(inside) + signal(outside));
+    (half * half + sigma * sigma * (2.0 - variance(half))).sqrt()
+}
+
+/// Noise of a magnitude image within the lumen, where it is Gaussian (second differences along rows); that of the whole
+/// stack where the lumen is too small to tell, which in a mostly black image is Rayleigh noise and a third too small. `None`
+/// where negative values say that it is no magnitude image.
+fn rician(patch: &Patch, deep: &[u8], noise: f64) -> Option<f64> {
+    if noise <= 0.0 || patch.raw.iter().any(|&v| v < 0.0) {
+        return None;
+    }
+    let n = patch.n[0];
+    let within = |i: usize| deep[i] > ONE_PIXEL;
+    let inner = (1..deep.len().saturating_sub(1)).filter(|&i| i % n > 0 && i % n < n - 1);
+    let mut off: Vec<f64> = inner
+        .filter(|&i| within(i - 1) && within(i) && within(i + 1))
+        .map(|i| f64::from(patch.raw[i] - 0.5 * (patch.raw[i - 1] + patch.raw[i + 1])).abs())
+        .collect();
+    let told = off.len() >= LEAST_INNER;
+    Some(if told { median(&mut off) * 1.4826 / 1.5_f64.sqrt() } else { noise })
+}
+
+/// Depth within which the blurred rim begins, tenths of a pixel.
+const ONE_PIXEL: u8 = 10;
+/// Values that tell the noise within the lumen to 10 %.
+const LEAST_INNER: usize = 100;
+
+fn finished(
+    patch: &Patch,
+    settings: &Settings,
+    mask: &[bool],
+    fields: &Fields,
+    (noise, warnings): (f64, Vec<Warning>),
+) -> Segmentation {
     let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
     let near = patch.distances(mask, BAND);
     let deep = patch.distances(&outside, BAND);
+    let rician = rician(patch, &deep, noise);
     let site = (0..mask.len())
         .map(|i| match (mask[i], near[i] <= BAND, deep[i] <= BAND) {
             (true, _, false) => Site::Deep,
@@ -335,7 +376,14 @@ fn finished(patch: &Patch, settings: &Settings, mask: &[bool], fields: Fields, w
         .collect();
     let level: Vec<f32> = match settings.threshold {
         Some(t) => vec![t as f32; mask.len()],
-        None => (0..mask.len()).map(|i| fields.level(i)).collect(),
+        None => (0..mask.len())
+            .map(|i| match rician {
+                Some(sigma) if mask[i] || near[i] <= BAND => {
+                    half_level(f64::from(fields.inside[i]), f64::from(fields.outside[i]), sigma) as f32
+                }
+                _ => fields.level(i),
+            })
+            .collect(),
     };
     let contrast = (0..mask.len()).map(|i| fields.contrast(i)).collect();
     let mut levels: Vec<f64> = (0..mask.len()).filter(|&i| mask[i]).map(|i| f64::from(level[i])).collect();
@@ -346,7 +394,7 @@ fn finished(patch: &Patch, settings: &Settings, mask: &[bool], fields: Fields, w
         site,
         level,
         contrast,
-        noise: 0.0,
+        noise,
         threshold,
         candidates: Vec::new(),
         radius_mm: radius(patch, mask),

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 /// Programs that judge our files; versions are pinned so that a green run stays green.
 const PYTHON_PACKAGES: &[&str] = &[
     "numpy",
+    "scipy<2",
     "vtk==9.5.2",
     "networkx==3.6.1",
     "pydicom==3.0.2",
