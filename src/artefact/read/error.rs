@@ -158,7 +158,9 @@ pub enum Error {
         degrees: f64,
     },
     /// `dicom.ambiguous_series`
-    #[error("two series of {slices} slices each ({first}, {second}); send only the one that is meant")]
+    #[error(
+        "two series of {slices} slices each ({first}, {second}); send only the one that is meant or name it in the plan (series)"
+    )]
     AmbiguousSeries {
         /// A file of one series.
         first: String,
@@ -166,6 +168,14 @@ pub enum Error {
         second: String,
         /// Slices of each.
         slices: usize,
+    },
+    /// `dicom.no_such_series`
+    #[error("the plan names series {name} and the upload holds {known}; name one of them by number or UID")]
+    NoSuchSeries {
+        /// The plan's name.
+        name: String,
+        /// Series numbers there are.
+        known: String,
     },
     /// `dicom.burned_in_annotation`
     #[error("{file} says that patient data is burned into its pixels; send the original series")]
@@ -230,6 +240,7 @@ impl Faulty for Error {
             Self::GantryTilt { .. } => "dicom.gantry_tilt",
             Self::Sheared { .. } => "stack.sheared",
             Self::AmbiguousSeries { .. } => "dicom.ambiguous_series",
+            Self::NoSuchSeries { .. } => "dicom.no_such_series",
             Self::BurnedIn { .. } => "dicom.burned_in_annotation",
             Self::Archive { .. } => "archive.refused",
             Self::Plan(faults) => faults.code(),
@@ -258,6 +269,7 @@ impl Faulty for Error {
             }
             Self::TooLarge { file, .. } => Place { file: file.clone(), ..Place::default() },
             Self::Mixed { second, .. } | Self::AmbiguousSeries { second, .. } => Place::file(second),
+            Self::NoSuchSeries { .. } => Place::field("series"),
             Self::Plan(faults) => faults.place(),
             _ => Place::none(),
         }

@@ -33,7 +33,7 @@ pub fn intake(files: Vec<NamedBytes>, limits: &Limits) -> Result<Vec<NamedBytes>
         }
         Kind::Nifti => {
             for (i, f) in images.iter().enumerate() {
-                out.push(numbered(i + 1, "nii", nifti::anonymous(&f.name, &f.bytes)?));
+                out.push(numbered(i + 1, "nii", nifti::anonymous(f, &others)?));
             }
         }
         Kind::MetaImage => {

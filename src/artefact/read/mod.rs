@@ -14,6 +14,7 @@ mod collect;
 mod detect;
 mod dicom;
 mod error;
+mod fields;
 mod intake;
 mod limits;
 mod metaimage;

@@ -2,6 +2,7 @@
 
 use super::collect::{collect, expand};
 use super::detect::{Kind, is_document, is_plan, kind};
+use super::fields::companion;
 use super::volume::{Placement, Volume};
 use super::{Error, Limits, NamedBytes, archive, dicom, metaimage, nifti, nrrd, pictures};
 use crate::plan::{Geometry, Plan};
@@ -15,7 +16,7 @@ use std::path::PathBuf;
 pub enum Format {
     /// DICOM.
     Dicom,
-    /// NIfTI-1.
+    /// NIfTI.
     Nifti,
     /// MetaImage.
     MetaImage,
@@ -90,11 +91,15 @@ pub fn stack_of(files: Vec<NamedBytes>, plan: &Plan, limits: &Limits) -> Result<
     let sorted = sort(expand(files, limits)?, limits)?;
     let mut warnings = sorted.warnings;
     let geometry = geometry(plan, &sorted.plans, sorted.kind, &mut warnings)?;
+    if plan.series.is_some() && sorted.kind != Kind::Dicom {
+        let message = "only DICOM has series; that of the plan was not used";
+        warnings.push(Warning::new("plan.series_ignored", message, Place::field("series")));
+    }
     let images = sorted.images;
     let mut acquisition = Acquisition::default();
     let (format, placement) = match sorted.kind {
         Kind::Dicom => {
-            let (placement, facts) = dicom::stack(&images, limits)?;
+            let (placement, facts) = dicom::stack(&images, plan.series.as_deref(), limits)?;
             acquisition = facts;
             (Format::Dicom, placement)
         }
@@ -103,7 +108,7 @@ pub fn stack_of(files: Vec<NamedBytes>, plan: &Plan, limits: &Limits) -> Result<
             let [image] = &images[..] else { return Err(several(&images, kind)) };
             let others: Vec<&NamedBytes> = sorted.others.iter().collect();
             let (format, (volume, mut more)): (_, (Volume, Vec<Warning>)) = match kind {
-                Kind::Nifti => (Format::Nifti, nifti::volume(&image.name, &image.bytes, limits)?),
+                Kind::Nifti => (Format::Nifti, nifti::volume(image, &others, limits)?),
                 Kind::Nrrd => (Format::Nrrd, nrrd::volume(image, &others, limits)?),
                 _ => (Format::MetaImage, metaimage::volume(image, &others, limits)?),
             };
@@ -175,16 +180,16 @@ pub(crate) fn sort(files: Vec<NamedBytes>, limits: &Limits) -> Result<Sorted, Er
         .filter_map(|(kind, file)| match kind {
             Kind::MetaImage => metaimage::data_file(file),
             Kind::Nrrd => nrrd::data_file(file),
+            Kind::Nifti => nifti::data_file(file),
             _ => None,
         })
         .collect();
-    let stray = others.iter().find(|f: &&NamedBytes| !named.iter().any(|n| metaimage::companion(&[*f], n).is_some()));
+    let stray = others.iter().find(|f: &&NamedBytes| !named.iter().any(|n| companion(&[*f], n).is_some()));
     if let Some(file) = stray {
         let reason = if file.bytes.is_empty() {
             "it is empty; send it again".to_owned()
         } else {
-            "it is no image that is read (DICOM, NIfTI-1, MetaImage, NRRD, PNG, PGM, JPEG, TIFF); leave it out"
-                .to_owned()
+            "it is no image that is read (DICOM, NIfTI, MetaImage, NRRD, PNG, PGM, JPEG, TIFF); leave it out".to_owned()
         };
         return Err(Error::Unsupported { file: file.name.clone(), reason });
     }
