@@ -43,7 +43,7 @@ pub(crate) fn validate(a: &Validate) -> ExitCode {
         Err(failure) => return report(&failure, a.json),
     };
     if let Some(path) = &a.pixels
-        && let Err(failure) = write_pixels(path, &understood.stack.pixels)
+        && let Err(failure) = write_pixels(path, &understood)
     {
         return report(&failure, a.json);
     }
@@ -51,9 +51,11 @@ pub(crate) fn validate(a: &Validate) -> ExitCode {
     understood.refusal.map_or(ExitCode::SUCCESS, |failure| report(&failure, a.json))
 }
 
-/// Grey values as little-endian singles, slice by slice, row by row: other programs compare them with theirs.
-fn write_pixels(path: &Path, pixels: &[f32]) -> Result<(), Failure> {
-    let bytes: Vec<u8> = pixels.iter().flat_map(|p| p.to_le_bytes()).collect();
+/// Grey values, then the mask where there is one, as little-endian singles, slice by slice, row by row: other programs
+/// compare them with theirs.
+fn write_pixels(path: &Path, read: &pipeline::Understood) -> Result<(), Failure> {
+    let mask = read.mask.iter().flat_map(|m| m.inside()).map(|&m| f32::from(u8::from(m)));
+    let bytes: Vec<u8> = read.stack.pixels.iter().copied().chain(mask).flat_map(f32::to_le_bytes).collect();
     std::fs::write(path, bytes).map_err(|e| Failure::internal(format!("{} cannot be written: {e}", path.display())))
 }
 

@@ -52,7 +52,8 @@ fn reconstruct(
     let mut steps = Steps::new(ctx, observer);
 
     let (stack, input) = steps.step("read", |_| artefact::read::stack(inputs, plan, &Limits::default()))?;
-    let (contours, segmentation) = steps.step("contours", |ctx| imaging::contours(&stack, &plan.imaging(), ctx))?;
+    let (contours, segmentation) =
+        steps.step("contours", |ctx| imaging::contours(&stack, &input.imaging(plan), ctx))?;
     let (f, fit) = steps.step("fit", |ctx| implicit::fit(&contours, &implicit::Settings::default(), ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
     let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
@@ -257,6 +258,8 @@ pub struct Understood {
     pub refusal: Option<Failure>,
     /// The stack as it was read.
     pub stack: Stack,
+    /// The label mask that came with it.
+    pub mask: Option<imaging::Mask>,
 }
 
 /// What is understood of a scan and a plan, without a reconstruction: slices, spacing, orientation, lumens found. A scan
@@ -267,9 +270,9 @@ pub struct Understood {
 pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood, Failure> {
     refuse_unmade(plan)?;
     let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
-    let outcome = imaging::contours(&stack, &plan.imaging(), ctx);
+    let outcome = imaging::contours(&stack, &input.imaging(plan), ctx);
     let facts = understood(&stack, &input, outcome.as_ref().ok());
-    Ok(Understood { facts, refusal: outcome.err().map(|e| Failure::of(&e)), stack })
+    Ok(Understood { facts, refusal: outcome.err().map(|e| Failure::of(&e)), stack, mask: input.mask })
 }
 
 /// As [`validate`], but nothing is segmented: the input alone, for comparison with other programs' readers.
@@ -278,7 +281,7 @@ pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood
 /// [`Failure`] of reading.
 pub fn input(inputs: &[PathBuf], plan: &Plan) -> Result<Understood, Failure> {
     let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
-    Ok(Understood { facts: understood(&stack, &input, None), refusal: None, stack })
+    Ok(Understood { facts: understood(&stack, &input, None), refusal: None, stack, mask: input.mask })
 }
 
 fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imaging::Report)>) -> Value {
@@ -303,6 +306,7 @@ fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imag
             "corners_mm": corners(stack),
             "row_direction": stack.row_direction.to_array(), "column_direction": stack.column_direction.to_array(),
             "thickness_mm": stack.thickness_mm,
+            "mask_voxels": input.mask.as_ref().map(|m| m.inside().iter().filter(|&&i| i).count()),
         },
         "segmentation": segmentation,
         "warnings": warnings,

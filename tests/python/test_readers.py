@@ -70,7 +70,11 @@ class Read:
                 facts = json.loads(done.stdout)
                 self.input, self.warnings = facts["input"], [w["code"] for w in facts["warnings"]]
                 shape = [self.input[k] for k in ("slices", "rows", "columns")]
-                self.pixels = np.fromfile(pixels, "<f4").reshape(shape)
+                values = np.fromfile(pixels, "<f4")
+                count = int(np.prod(shape))
+                self.pixels = values[:count].reshape(shape)
+                # the mask, where there is one, follows as zeros and ones
+                self.mask = values[count:].reshape(shape) if len(values) > count else None
 
 
 def assert_same(read, array, affine, mm=MM, grey=0.0):
@@ -517,6 +521,114 @@ def test_dicom_as_itk_writes_it():
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(names)
     assert_same(Read(path), *itk_truth(reader.Execute()), mm=1e-5)
+
+
+# ---- label masks -----------------------------------------------------------------------------------------------------
+
+
+def mask_of(shape=(5, 40, 36)):
+    """Labels 1 and 4: a slanted block and a small one."""
+    mask = np.zeros(shape, np.uint8)
+    for k in range(shape[0]):
+        mask[k, 10 + k : 22 + k, 9:20] = 1
+    mask[1:3, 30:34, 28:32] = 4
+    return mask
+
+
+def segmentation(mask, affine, segments, kind="BINARY"):
+    """A DICOM segmentation as the standard's A.51 has it: one frame per segment and slice that shows it."""
+    ds = enhanced(mask.astype(np.int16), affine, np.arange(len(mask)))
+    ds.SOPClassUID = ds.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.66.4"
+    ds.Modality, ds.SegmentationType = "SEG", kind
+    frames, pixels = [], []
+    for number in segments:
+        for k, plane in enumerate(mask):
+            if not (plane == number).any():
+                continue
+            frame, position, of = Dataset(), Dataset(), Dataset()
+            position.ImagePositionPatient = [float(x) for x in affine[:3, 3] + k * affine[:3, 2]]
+            of.ReferencedSegmentNumber = number
+            frame.PlanePositionSequence, frame.SegmentIdentificationSequence = Sequence([position]), Sequence([of])
+            frames.append(frame)
+            pixels.append(plane == number)
+    ds.NumberOfFrames = len(frames)
+    ds.PerFrameFunctionalGroupsSequence = Sequence(frames)
+    bits = 1 if kind == "BINARY" else 8
+    ds.BitsAllocated = ds.BitsStored = bits
+    ds.HighBit, ds.PixelRepresentation = bits - 1, 0
+    if kind == "BINARY":
+        ds.PixelData = pydicom.pixels.pack_bits(np.array(pixels).astype(np.uint8).ravel())
+    else:
+        ds.MaximumFractionalValue = 200
+        ds.PixelData = (np.array(pixels) * 200).astype(np.uint8).tobytes()
+    ds["PixelData"].VR = "OB"
+    return ds
+
+
+def marked(read):
+    assert read.input is not None, read.problem
+    return read.input["mask_voxels"]
+
+
+def test_masks_of_nibabel_and_itk_on_dicom():
+    mask = mask_of()
+    for flips in range(8):
+        step = [slice(None, None, 1 - 2 * (flips >> a & 1)) for a in range(3)]
+        for turned in [False, True]:
+            path = saved(scan(noise()))
+            # the same voxels in another order: flipped, and with its first two axes exchanged
+            signs = [1 - 2 * (flips >> (2 - a) & 1) for a in range(3)]
+            affine = AFFINE @ np.diag([*signs, 1.0])
+            last = [(n - 1) * (s < 0) for n, s in zip(mask.shape[::-1], signs)]
+            affine[:3, 3] = (AFFINE @ [*last, 1.0])[:3]
+            values = mask[tuple(step)].transpose(2, 1, 0)
+            if turned:
+                values, affine = values.transpose(1, 0, 2), affine[:, [1, 0, 2, 3]]
+            nibabel.save(nibabel.Nifti1Image(np.ascontiguousarray(values), RAS @ affine), path / "scan_seg.nii.gz")
+            for label in (1, 4):
+                read = Read(path, {"segmentation": {"label": label}})
+                assert marked(read) == (mask == label).sum()
+                assert (read.mask == (mask == label)).all()
+            refused(Read(path), "mask.label")
+    out = folder()
+    image = itk_image(mask)
+    sitk.WriteImage(itk_image(noise()), out / "a.nrrd")
+    sitk.WriteImage(image, out / "label.nrrd", useCompression=True)
+    assert (Read(out, {"segmentation": {"label": 4}}).mask == (mask == 4)).all()
+
+
+def test_dicom_segmentations():
+    mask = mask_of()
+    for kind in ["BINARY", "FRACTIONAL"]:
+        for syntax in [None, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian]:
+            path = saved(scan(noise()))
+            written = saved([segmentation(mask, AFFINE, [1, 4], kind)], syntax)
+            (written / "im000").rename(path / "segments")
+            for label in (1, 4):
+                read = Read(path, {"segmentation": {"label": label}})
+                assert_same(read, noise(), AFFINE)
+                assert (read.mask == (mask == label)).all(), (kind, label)
+            refused(Read(path), "mask.label")
+    path = saved(scan(noise()))
+    (saved([segmentation(mask, AFFINE, [1])]) / "im000").rename(path / "segments")
+    assert (Read(path).mask == (mask == 1)).all()
+
+
+def test_a_mask_off_the_scans_voxels_is_refused():
+    shifted = AFFINE.copy()
+    shifted[:3, 3] += 0.3 * AFFINE[:3, 0]
+    path = saved(scan(noise()))
+    nibabel.save(nibabel.Nifti1Image((mask_of() == 1).astype(np.uint8).transpose(2, 1, 0), RAS @ shifted), path / "mask.nii")
+    refused(Read(path), "mask.geometry")
+
+
+def test_a_mask_alone_is_its_own_image():
+    mask = (mask_of() == 1).astype(np.uint8)
+    out = folder()
+    nibabel.save(nibabel.Nifti1Image(mask.transpose(2, 1, 0), RAS @ AFFINE), out / "mask.nii")
+    read = Read(out)
+    assert_same(read, mask, AFFINE, mm=MM_SINGLE)
+    assert read.input["format"] == "mask" and "mask.alone" in read.warnings and (read.mask == mask).all()
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------

@@ -177,6 +177,27 @@ pub enum Error {
         /// Series numbers there are.
         known: String,
     },
+    /// `mask.label`
+    #[error(
+        "{file} holds the labels {known}{}; name the lumen's in the plan (segmentation.label)",
+        wanted.map(|w| format!(" and the plan wants {w}")).unwrap_or_default()
+    )]
+    Label {
+        /// The mask.
+        file: String,
+        /// The plan's label.
+        wanted: Option<u16>,
+        /// Labels there are.
+        known: String,
+    },
+    /// `mask.geometry`
+    #[error("{file}: its voxels lie {off_voxels:.2} voxels beside those of the scan; draw the mask on this series")]
+    MaskGeometry {
+        /// The mask.
+        file: String,
+        /// Largest distance from a voxel of the scan, in voxels.
+        off_voxels: f64,
+    },
     /// `dicom.burned_in_annotation`
     #[error("{file} says that patient data is burned into its pixels; send the original series")]
     BurnedIn {
@@ -241,6 +262,8 @@ impl Faulty for Error {
             Self::Sheared { .. } => "stack.sheared",
             Self::AmbiguousSeries { .. } => "dicom.ambiguous_series",
             Self::NoSuchSeries { .. } => "dicom.no_such_series",
+            Self::Label { .. } => "mask.label",
+            Self::MaskGeometry { .. } => "mask.geometry",
             Self::BurnedIn { .. } => "dicom.burned_in_annotation",
             Self::Archive { .. } => "archive.refused",
             Self::Plan(faults) => faults.code(),
@@ -259,6 +282,7 @@ impl Faulty for Error {
             | Self::Colour { file }
             | Self::NotFinite { file, .. }
             | Self::Sheared { file, .. }
+            | Self::MaskGeometry { file, .. }
             | Self::BurnedIn { file }
             | Self::Archive { file, .. } => Place::file(file),
             Self::GeometryMissing { file, field, .. } => {
@@ -269,6 +293,9 @@ impl Faulty for Error {
             }
             Self::TooLarge { file, .. } => Place { file: file.clone(), ..Place::default() },
             Self::Mixed { second, .. } | Self::AmbiguousSeries { second, .. } => Place::file(second),
+            Self::Label { file, .. } => {
+                Place { file: Some(file.clone()), field: Some("segmentation.label".to_owned()), ..Place::default() }
+            }
             Self::NoSuchSeries { .. } => Place::field("series"),
             Self::Plan(faults) => faults.place(),
             _ => Place::none(),

@@ -17,6 +17,7 @@ mod error;
 mod fields;
 mod intake;
 mod limits;
+mod mask;
 mod metaimage;
 mod nifti;
 mod nrrd;

@@ -11,10 +11,12 @@ pub(crate) mod dataset;
 mod jpegls;
 mod pixels;
 mod rle;
+mod segments;
 mod series;
 pub(crate) mod table;
 
 pub(crate) use anonymous::anonymous;
+pub(crate) use segments::{is_segmentation, labels};
 
 use super::report::Acquisition;
 use super::volume::{Frame, Placed, Placement, orthonormal, place};

@@ -94,8 +94,8 @@ impl Layout {
         let allocated = short(BITS_ALLOCATED, "BitsAllocated")?;
         let stored = ds.short(BITS_STORED).unwrap_or(allocated);
         let high_bit = ds.short(HIGH_BIT).unwrap_or(stored.saturating_sub(1));
-        if ![8, 16, 32].contains(&allocated) {
-            let reason = format!("{allocated} bits per pixel are not read; 8, 16 and 32 are");
+        if ![1, 8, 16, 32].contains(&allocated) {
+            let reason = format!("{allocated} bits per pixel are not read; 1, 8, 16 and 32 are");
             return Err(Error::Unsupported { file: file.to_owned(), reason });
         }
         if stored == 0 || stored > allocated || high_bit >= allocated || high_bit + 1 < stored {
@@ -113,8 +113,9 @@ impl Layout {
         })
     }
 
-    fn frame_bytes(&self) -> usize {
-        self.rows * self.columns * usize::from(self.allocated / 8)
+    /// Bytes of all frames; single bits are packed across rows and frames (PS3.5 8.2).
+    fn bytes(&self) -> usize {
+        (self.frames * self.rows * self.columns * usize::from(self.allocated)).div_ceil(8)
     }
 
     /// The value of one little-endian sample: bits low to high, other bits (old overlays) masked, sign extended.
@@ -137,11 +138,17 @@ impl Layout {
         frame: usize,
         (slope, intercept): (f64, f64),
     ) -> Result<Vec<f32>, Error> {
-        let size = self.frame_bytes();
-        let Some(bytes) = samples.get(frame * size..(frame + 1) * size) else {
-            let (needed, found) = ((self.frames * size) as u64, samples.len() as u64);
+        let count = self.rows * self.columns;
+        let size = count * usize::from(self.allocated / 8);
+        if samples.len() < self.bytes() || frame >= self.frames {
+            let (needed, found) = (self.bytes() as u64, samples.len() as u64);
             return Err(Error::Truncated { file: file.to_owned(), what: "the pixel data", needed, found });
-        };
+        }
+        if self.allocated == 1 {
+            let bit = |i: usize| f64::from(samples[i / 8] >> (i % 8) & 1);
+            return Ok((frame * count..(frame + 1) * count).map(|i| (slope * bit(i) + intercept) as f32).collect());
+        }
+        let bytes = &samples[frame * size..(frame + 1) * size];
         let width = usize::from(self.allocated / 8);
         Ok(bytes.chunks_exact(width).map(|s| (slope * self.value(s) + intercept) as f32).collect())
     }
@@ -153,7 +160,7 @@ impl Layout {
 /// [`Error::Truncated`] without (whole) pixel data, [`Error::Unsupported`] or [`Error::Malformed`] when a compressed
 /// frame cannot be decoded.
 pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layout) -> Result<Cow<'a, [u8]>, Error> {
-    let needed = (layout.frames * layout.frame_bytes()) as u64;
+    let needed = layout.bytes() as u64;
     match ds.elements.get(&PIXEL_DATA) {
         Some(Value::Bytes(bytes, vr)) => {
             if (bytes.len() as u64) < needed {
@@ -163,7 +170,7 @@ pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layo
             let word = match ds.order {
                 Order::Little => 1,
                 // 8-bit pixels in 16-bit words are swapped with the words
-                Order::Big if layout.allocated == 8 && *vr != Some(*b"OW") => 1,
+                Order::Big if layout.allocated <= 8 && *vr != Some(*b"OW") => 1,
                 Order::Big => usize::from(layout.allocated / 8).max(2),
             };
             if word == 1 {
@@ -180,6 +187,10 @@ pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layo
 /// (a decoder allocates by that) and a guard against panics of the decoders.
 fn decoded(file: &str, fragments: &[&[u8]], uid: &str, layout: &Layout) -> Result<Vec<u8>, Error> {
     let malformed = |reason: String| Error::Malformed { file: file.to_owned(), reason };
+    if layout.allocated == 1 {
+        let reason = "compressed single bits are not read; export it uncompressed".to_owned();
+        return Err(Error::Unsupported { file: file.to_owned(), reason });
+    }
     match uid {
         JPEG_LS | JPEG_LS_NEAR => return jpeg_ls(fragments, layout).map_err(malformed),
         RLE => return run_lengths(fragments, layout).map_err(malformed),
