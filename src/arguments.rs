@@ -121,6 +121,9 @@ pub(crate) struct Validate {
     /// What was understood, or the fault, as JSON.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Read only, and write the grey values to this file (little-endian singles); nothing is segmented.
+    #[arg(long, hide = true)]
+    pub(crate) pixels: Option<PathBuf>,
 }
 
 #[derive(Args)]

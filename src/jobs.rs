@@ -32,20 +32,31 @@ pub(crate) fn run(a: &Run) -> ExitCode {
     }
 }
 
-/// What was understood of a scan and a plan.
+/// What was understood of a scan and a plan; the input is told even where the segmentation is refused.
 pub(crate) fn validate(a: &Validate) -> ExitCode {
-    let outcome = plan_of(a.plan.as_deref()).and_then(|plan| pipeline::validate(&a.input, &plan, &context(a.threads)?));
-    match outcome {
-        Ok(understood) if a.json => {
-            println!("{understood:#}");
-            ExitCode::SUCCESS
-        }
-        Ok(understood) => {
-            print!("{}", words(&understood, 0));
-            ExitCode::SUCCESS
-        }
-        Err(failure) => report(&failure, a.json),
+    let outcome = plan_of(a.plan.as_deref()).and_then(|plan| match a.pixels {
+        Some(_) => pipeline::input(&a.input, &plan),
+        None => pipeline::validate(&a.input, &plan, &context(a.threads)?),
+    });
+    let understood = match outcome {
+        Ok(understood) => understood,
+        Err(failure) => return report(&failure, a.json),
+    };
+    if let Some(path) = &a.pixels
+        && let Err(failure) = write_pixels(path, &understood)
+    {
+        return report(&failure, a.json);
     }
+    print!("{}", if a.json { format!("{:#}\n", understood.facts) } else { words(&understood.facts, 0) });
+    understood.refusal.map_or(ExitCode::SUCCESS, |failure| report(&failure, a.json))
+}
+
+/// Grey values, then the mask where there is one, as little-endian singles, slice by slice, row by row: other programs
+/// compare them with theirs.
+fn write_pixels(path: &Path, read: &pipeline::Understood) -> Result<(), Failure> {
+    let mask = read.mask.iter().flat_map(|m| m.inside()).map(|&m| f32::from(u8::from(m)));
+    let bytes: Vec<u8> = read.stack.pixels.iter().copied().chain(mask).flat_map(f32::to_le_bytes).collect();
+    std::fs::write(path, bytes).map_err(|e| Failure::internal(format!("{} cannot be written: {e}", path.display())))
 }
 
 /// One job of a worker: progress as JSON lines on standard output; ends when standard input closes, so that a killed

@@ -18,6 +18,9 @@ use serde::{Deserialize, Serialize};
 pub struct Plan {
     /// Geometry for images that carry none.
     pub geometry: Geometry,
+    /// Which of several DICOM series is meant: its SeriesNumber or SeriesInstanceUID.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub series: Option<String>,
     /// Segmentation overrides.
     pub segmentation: Segmentation,
     /// Contour settings.
@@ -68,6 +71,9 @@ pub struct Segmentation {
     pub exclude_slices: Vec<usize>,
     /// Point spread, Gaussian sigma in pixels.
     pub psf_sigma_px: Option<f64>,
+    /// Which label (DICOM: segment number) of a mask in the upload is the lumen; absent: its only one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label: Option<u16>,
 }
 
 /// A circle on a slice.

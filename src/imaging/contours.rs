@@ -64,7 +64,8 @@ pub fn contours(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contou
         r.slice -= (0..r.slice).filter(|k| settings.exclude_slices.contains(k)).count();
         r
     });
-    found(&kept, &Settings { region, exclude_slices: Vec::new(), ..settings.clone() }, ctx)
+    let mask = settings.mask.as_ref().map(|m| m.without(&settings.exclude_slices, stack.rows * stack.columns));
+    found(&kept, &Settings { region, mask, exclude_slices: Vec::new(), ..settings.clone() }, ctx)
 }
 
 fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Report), Error> {

@@ -95,6 +95,12 @@ pub enum Error {
         /// What was missed, with numbers.
         reason: String,
     },
+    /// A label mask that cannot be the lumen of this stack.
+    #[error("the label mask cannot be used: {reason}; draw it on this series")]
+    Mask {
+        /// What is wrong with it.
+        reason: String,
+    },
     /// A seed in the background.
     #[error(
         "seed {seed} lies in no bright structure (grey value {value:.1}, at least {needed:.1} is needed); \
@@ -170,6 +176,7 @@ impl Faulty for Error {
             Self::NotFinite { .. } => "stack.not_finite",
             Self::Uniform { .. } => "stack.uniform",
             Self::NoVessel { .. } => "segmentation.no_vessel",
+            Self::Mask { .. } => "segmentation.mask",
             Self::SeedOutside { .. } => "segmentation.seed_outside",
             Self::NoSuchSlice { .. } => "segmentation.no_such_slice",
             Self::Setting { .. } => "segmentation.setting",

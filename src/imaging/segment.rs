@@ -80,9 +80,12 @@ const BAND: u8 = 20;
 ///
 /// # Errors
 /// [`Error::Uniform`], [`Error::NoVessel`], [`Error::SeedOutside`], [`Error::NoSuchSlice`], [`Error::Setting`],
-/// [`Error::Cancelled`].
+/// [`Error::Mask`], [`Error::Cancelled`].
 pub fn segment(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<Segmentation, Error> {
     check(stack, settings)?;
+    if let Some(mask) = &settings.mask {
+        return crate::mask::segmentation(stack, mask, settings, ctx);
+    }
     let raw_noise = noise(stack);
     let (smooth, factor) = Volume::denoised(stack, ctx)?;
     ctx.progress(0.1);
@@ -278,12 +281,12 @@ fn global(patch: &Patch, i: usize) -> [usize; 3] {
     std::array::from_fn(|a| p[a] + patch.low[a])
 }
 
-fn patch_index(patch: &Patch, p: [usize; 3]) -> usize {
+pub(crate) fn patch_index(patch: &Patch, p: [usize; 3]) -> usize {
     let q: [usize; 3] = std::array::from_fn(|a| p[a] - patch.low[a]);
     q[0] + patch.n[0] * (q[1] + patch.n[1] * q[2])
 }
 
-fn patch(stack: &Stack, smooth: &Volume, voxels: &[[usize; 3]]) -> Patch {
+pub(crate) fn patch(stack: &Stack, smooth: &Volume, voxels: &[[usize; 3]]) -> Patch {
     let mut low = [usize::MAX; 3];
     let mut high = [0; 3];
     for p in voxels {
@@ -403,7 +406,7 @@ fn finished(
 }
 
 /// 2 V / A with face areas x pi/4.
-fn radius(patch: &Patch, mask: &[bool]) -> f64 {
+pub(crate) fn radius(patch: &Patch, mask: &[bool]) -> f64 {
     let [a, b, c] = patch.step;
     let face = [b * c, a * c, a * b];
     let stride = [1, patch.n[0], patch.n[0] * patch.n[1]];

@@ -1,6 +1,6 @@
 //! What the user may set of the segmentation and the contours.
 
-use crate::Axis;
+use crate::{Axis, Mask};
 use space::P3;
 
 /// Settings of [`crate::contours`]; the defaults are fully automatic.
@@ -16,6 +16,8 @@ pub struct Settings {
     pub exclude_slices: Vec<usize>,
     /// Point spread (Gaussian sigma) in pixels instead of the estimate.
     pub psf_sigma_px: Option<f64>,
+    /// A lumen that is already drawn, instead of the search for one: region and seeds then mean nothing.
+    pub mask: Option<Mask>,
     /// Contour axis; `None` chooses the axis that the vessel follows.
     pub axis: Option<Axis>,
 }

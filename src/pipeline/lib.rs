@@ -8,5 +8,5 @@ mod reconstruct;
 mod step;
 
 pub use failure::Failure;
-pub use reconstruct::{run, validate};
+pub use reconstruct::{Understood, input, run, validate};
 pub use step::{Event, Observer};

@@ -63,7 +63,8 @@ fn reconstruct(
     let mut steps = Steps::new(ctx, observer);
 
     let (stack, input) = steps.step("read", |_| artefact::read::stack(inputs, plan, &Limits::default()))?;
-    let (contours, segmentation) = steps.step("contours", |ctx| imaging::contours(&stack, &plan.imaging(), ctx))?;
+    let (contours, segmentation) =
+        steps.step("contours", |ctx| imaging::contours(&stack, &input.imaging(plan), ctx))?;
     let (f, fit, ensemble) =
         steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &implicit::Settings::default(), DRAWS, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
@@ -325,40 +326,74 @@ fn surface_data<'a>(wall: &'a Wall, pixel_mm: f64, graph: &MedialGraph, morphome
     }
 }
 
-/// What is understood of a scan and a plan, without a reconstruction: slices, spacing, orientation, lumens found.
-///
-/// # Errors
-/// [`Failure`] of reading or of the segmentation.
-pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Value, Failure> {
-    refuse_unmade(plan)?;
-    let fault = |e: &dyn space::Faulty| Failure::of(e);
-    let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| fault(&e))?;
-    let (contours, report) = imaging::contours(&stack, &plan.imaging(), ctx).map_err(|e| fault(&e))?;
-    Ok(understood(&stack, &input, &contours, &report))
+/// What is understood of a scan and a plan.
+pub struct Understood {
+    /// Input, segmentation (null where it was refused) and warnings, as `validate --json` prints them.
+    pub facts: Value,
+    /// Why no contours were found in a scan that could be read.
+    pub refusal: Option<Failure>,
+    /// The stack as it was read.
+    pub stack: Stack,
+    /// The label mask that came with it.
+    pub mask: Option<imaging::Mask>,
 }
 
-fn understood(stack: &Stack, input: &InputReport, contours: &Contours, report: &imaging::Report) -> Value {
-    let facts = facts::segmentation(contours, report);
+/// What is understood of a scan and a plan, without a reconstruction: slices, spacing, orientation, lumens found. A scan
+/// that is read but shows no vessel still has its input told, so that geometry can be checked without one.
+///
+/// # Errors
+/// [`Failure`] of the plan or of reading.
+pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood, Failure> {
+    refuse_unmade(plan)?;
+    let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
+    let outcome = imaging::contours(&stack, &input.imaging(plan), ctx);
+    let facts = understood(&stack, &input, outcome.as_ref().ok());
+    Ok(Understood { facts, refusal: outcome.err().map(|e| Failure::of(&e)), stack, mask: input.mask })
+}
+
+/// As [`validate`], but nothing is segmented: the input alone, for comparison with other programs' readers.
+///
+/// # Errors
+/// [`Failure`] of reading.
+pub fn input(inputs: &[PathBuf], plan: &Plan) -> Result<Understood, Failure> {
+    let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
+    Ok(Understood { facts: understood(&stack, &input, None), refusal: None, stack, mask: input.mask })
+}
+
+fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imaging::Report)>) -> Value {
+    let segmentation = found.map(|(contours, report)| {
+        let facts = facts::segmentation(contours, report);
+        json!({
+            "axis": facts.axis, "threshold": facts.threshold, "psf_sigma_px": facts.psf_sigma_px,
+            "contours": facts.contours,
+            "lumens": facts.lumens.iter().map(|[s, n]| json!({"slice": s, "count": n})).collect::<Vec<_>>(),
+        })
+    });
     let warnings: Vec<Value> = input
         .warnings
         .iter()
-        .chain(&report.warnings)
+        .chain(found.iter().flat_map(|(_, report)| &report.warnings))
         .map(|w| json!({"code": w.code, "message": w.message, "where": artefact::problem::Where::of(&w.place)}))
         .collect();
-    let corner = |k: usize| stack.position(k, 0.0, 0.0).to_array();
     json!({
         "input": {
             "format": input.format.name(), "slices": input.slices, "rows": stack.rows, "columns": stack.columns,
             "missing_slices": input.missing_slices, "spacing_mm": input.spacing_mm, "digest": input.digest,
-            "first_pixel_mm": corner(0), "last_slice_first_pixel_mm": corner(stack.slices().saturating_sub(1)),
+            "corners_mm": corners(stack),
             "row_direction": stack.row_direction.to_array(), "column_direction": stack.column_direction.to_array(),
             "thickness_mm": stack.thickness_mm,
+            "mask_voxels": input.mask.as_ref().map(|m| m.inside().iter().filter(|&&i| i).count()),
         },
-        "segmentation": {
-            "axis": facts.axis, "threshold": facts.threshold, "psf_sigma_px": facts.psf_sigma_px,
-            "contours": facts.contours,
-            "lumens": facts.lumens.iter().map(|[s, n]| json!({"slice": s, "count": n})).collect::<Vec<_>>(),
-        },
+        "segmentation": segmentation,
         "warnings": warnings,
     })
+}
+
+/// Centres of the eight corner voxels, LPS mm: first and last slice, in each first and last row, in each first and last
+/// column.
+fn corners(stack: &Stack) -> Vec<[f64; 3]> {
+    let ends = |n: usize| [0, n.saturating_sub(1)];
+    let of_row = |k: usize, r: usize| ends(stack.columns).map(|c| stack.position(k, r as f64, c as f64).to_array());
+    let of_slice = |k: usize| ends(stack.rows).into_iter().flat_map(move |r| of_row(k, r));
+    ends(stack.slices()).into_iter().flat_map(of_slice).collect()
 }

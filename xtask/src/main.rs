@@ -2,6 +2,7 @@
 
 mod bench;
 mod check;
+mod fuzz;
 mod shell;
 mod survey;
 mod tools;
@@ -39,6 +40,15 @@ enum Command {
         #[arg(long, default_value_t = 1)]
         first: u64,
     },
+    /// Change valid files and read them again: no reader may panic, hang or allocate beyond its limits.
+    Fuzz {
+        /// Minutes for each reader.
+        #[arg(long, default_value_t = 10.0)]
+        minutes: f64,
+        /// Seed of the changes.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+    },
     /// Time and memory, beside other programs where there are any.
     Bench {
         /// What is measured.
@@ -67,6 +77,7 @@ fn run(command: Command) -> Result<()> {
         Command::Survey { count, first } => survey::run(&tools::release_binary()?, first, count),
         Command::Bench { what: bench::What::Whole, repeat } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat } => bench::thinning(repeat),
+        Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
     }
 }
 

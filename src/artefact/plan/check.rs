@@ -93,6 +93,10 @@ enum Rule {
     Index,
     /// A list of whole numbers.
     Indices,
+    /// A whole number from 1 that a sample of 16 bits can hold.
+    Label,
+    /// A series' number or UID: digits and dots, at most 64.
+    Series,
     /// One of some words.
     Word(&'static [&'static str]),
     /// A list of some words.
@@ -113,6 +117,7 @@ use Rule::*;
 /// The contract's plan. Spacings: 0.1 micrometre to 100 mm, between histology and a mistake of units.
 const PLAN: &[(&str, Rule)] = &[
     ("geometry", Object(GEOMETRY, Optional)),
+    ("series", Series),
     ("segmentation", Object(SEGMENTATION, Optional)),
     ("contours", Object(&[("axis", Word(&["auto", "slice", "row", "column"]))], Optional)),
     (
@@ -147,6 +152,7 @@ const SEGMENTATION: &[(&str, Rule)] = &[
     ("seeds_mm", Points),
     ("exclude_slices", Indices),
     ("psf_sigma_px", Number(0.0, 50.0)),
+    ("label", Label),
 ];
 
 impl Plan {
@@ -248,10 +254,17 @@ fn check(path: &str, value: &Value, rule: &Rule, faults: &mut Vec<PlanFault>) {
         }
         Index => (value.as_u64().is_none_or(|i| i > 1 << 20))
             .then(|| format!("a whole number from 0 is wanted, not {}", shown(value))),
+        Label => (!value.as_u64().is_some_and(|i| (1..=65_535).contains(&i)))
+            .then(|| format!("a whole number from 1 to 65535 is wanted, not {}", shown(value))),
         Indices => {
             let right = |a: &Vec<Value>| a.iter().all(|v| v.as_u64().is_some_and(|i| i <= 1 << 20));
             (!value.as_array().is_some_and(right))
                 .then(|| format!("a list of whole numbers from 0 is wanted, not {}", shown(value)))
+        }
+        Series => {
+            let right = |t: &str| !t.is_empty() && t.len() <= 64 && t.bytes().all(|b| b.is_ascii_digit() || b == b'.');
+            (!value.as_str().is_some_and(right))
+                .then(|| format!("a series number or UID in quotes is wanted, not {}", shown(value)))
         }
         Word(words) => (!value.as_str().is_some_and(|w| words.contains(&w)))
             .then(|| format!("one of {} is wanted, not {}", words.join(", "), shown(value))),

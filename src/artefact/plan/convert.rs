@@ -18,6 +18,7 @@ impl Plan {
             seeds: s.seeds_mm.iter().map(|p| P3::from(*p)).collect(),
             exclude_slices: s.exclude_slices.clone(),
             psf_sigma_px: s.psf_sigma_px,
+            mask: None, // comes with the upload, not with the plan
             axis: match self.contours.axis.as_deref() {
                 Some("slice") => Some(Axis::Slice),
                 Some("row") => Some(Axis::Row),

@@ -5,7 +5,7 @@
 pub(crate) enum Kind {
     /// DICOM, with or without preamble.
     Dicom,
-    /// NIfTI-1, possibly gzipped.
+    /// NIfTI, possibly gzipped.
     Nifti,
     /// MetaImage header, with or without its pixels.
     MetaImage,
@@ -69,7 +69,7 @@ fn is_tiff(bytes: &[u8]) -> bool {
     bytes.starts_with(b"II\x2a\0") || bytes.starts_with(b"MM\0\x2a")
 }
 
-/// sizeof_hdr is 348 (NIfTI-1) or 540 (NIfTI-2, which the reader refuses by name) in either byte order.
+/// sizeof_hdr is 348 (NIfTI-1) or 540 (NIfTI-2) in either byte order.
 fn is_nifti(bytes: &[u8]) -> bool {
     let Some(first) = bytes.first_chunk::<4>() else { return false };
     let sizes = [i32::from_le_bytes(*first), i32::from_be_bytes(*first)];

@@ -158,7 +158,9 @@ pub enum Error {
         degrees: f64,
     },
     /// `dicom.ambiguous_series`
-    #[error("two series of {slices} slices each ({first}, {second}); send only the one that is meant")]
+    #[error(
+        "two series of {slices} slices each ({first}, {second}); send only the one that is meant or name it in the plan (series)"
+    )]
     AmbiguousSeries {
         /// A file of one series.
         first: String,
@@ -166,6 +168,35 @@ pub enum Error {
         second: String,
         /// Slices of each.
         slices: usize,
+    },
+    /// `dicom.no_such_series`
+    #[error("the plan names series {name} and the upload holds {known}; name one of them by number or UID")]
+    NoSuchSeries {
+        /// The plan's name.
+        name: String,
+        /// Series numbers there are.
+        known: String,
+    },
+    /// `mask.label`
+    #[error(
+        "{file} holds the labels {known}{}; name the lumen's in the plan (segmentation.label)",
+        wanted.map(|w| format!(" and the plan wants {w}")).unwrap_or_default()
+    )]
+    Label {
+        /// The mask.
+        file: String,
+        /// The plan's label.
+        wanted: Option<u16>,
+        /// Labels there are.
+        known: String,
+    },
+    /// `mask.geometry`
+    #[error("{file}: its voxels lie {off_voxels:.2} voxels beside those of the scan; draw the mask on this series")]
+    MaskGeometry {
+        /// The mask.
+        file: String,
+        /// Largest distance from a voxel of the scan, in voxels.
+        off_voxels: f64,
     },
     /// `dicom.burned_in_annotation`
     #[error("{file} says that patient data is burned into its pixels; send the original series")]
@@ -230,6 +261,9 @@ impl Faulty for Error {
             Self::GantryTilt { .. } => "dicom.gantry_tilt",
             Self::Sheared { .. } => "stack.sheared",
             Self::AmbiguousSeries { .. } => "dicom.ambiguous_series",
+            Self::NoSuchSeries { .. } => "dicom.no_such_series",
+            Self::Label { .. } => "mask.label",
+            Self::MaskGeometry { .. } => "mask.geometry",
             Self::BurnedIn { .. } => "dicom.burned_in_annotation",
             Self::Archive { .. } => "archive.refused",
             Self::Plan(faults) => faults.code(),
@@ -248,6 +282,7 @@ impl Faulty for Error {
             | Self::Colour { file }
             | Self::NotFinite { file, .. }
             | Self::Sheared { file, .. }
+            | Self::MaskGeometry { file, .. }
             | Self::BurnedIn { file }
             | Self::Archive { file, .. } => Place::file(file),
             Self::GeometryMissing { file, field, .. } => {
@@ -258,6 +293,10 @@ impl Faulty for Error {
             }
             Self::TooLarge { file, .. } => Place { file: file.clone(), ..Place::default() },
             Self::Mixed { second, .. } | Self::AmbiguousSeries { second, .. } => Place::file(second),
+            Self::Label { file, .. } => {
+                Place { file: Some(file.clone()), field: Some("segmentation.label".to_owned()), ..Place::default() }
+            }
+            Self::NoSuchSeries { .. } => Place::field("series"),
             Self::Plan(faults) => faults.place(),
             _ => Place::none(),
         }

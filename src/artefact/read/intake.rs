@@ -15,44 +15,29 @@ use crate::write::png;
 
 /// Files that may be kept: no more than the images, and a plan where one lay beside them.
 ///
-/// Names are neutral (`image-00001.dcm`); the order of pictures is kept. Errors carry the client's own file names: give
+/// Names are neutral (`image-00001.dcm`, `mask-00001.nii`); the order of pictures is kept. Errors carry the client's own file names: give
 /// them back to the client, not to a log.
 ///
 /// # Errors
 /// See [`Error`]; among them `archive.refused`, `input.too_large`, `input.unsupported`, `dicom.burned_in_annotation`.
 pub fn intake(files: Vec<NamedBytes>, limits: &Limits) -> Result<Vec<NamedBytes>, Error> {
-    let Sorted { kind, images, others, plans, .. } = sort(expand(files, limits)?, limits)?;
+    let Sorted { kind, images, masks, others, plans, .. } = sort(expand(files, limits)?, limits)?;
     let others: Vec<&NamedBytes> = others.iter().collect();
-    let mut out: Vec<NamedBytes> = Vec::with_capacity(images.len() + plans.len());
-    match kind {
-        Kind::Dicom => {
-            for file in images {
-                let clean = dicom::anonymous(&file.name, &file.bytes, limits)?;
-                out.extend(clean.map(|bytes| numbered(out.len() + 1, "dcm", bytes)));
-            }
+    let mut out: Vec<NamedBytes> = Vec::with_capacity(images.len() + masks.len() + plans.len());
+    if kind == Kind::Picture {
+        for page in pictures::pages(&images, limits)? {
+            let (extension, bytes) = png::lossless(&page.pixels, page.columns, page.rows).map_err(Error::Internal)?;
+            out.push(numbered("image", out.len() + 1, extension, bytes));
         }
-        Kind::Nifti => {
-            for (i, f) in images.iter().enumerate() {
-                out.push(numbered(i + 1, "nii", nifti::anonymous(&f.name, &f.bytes)?));
-            }
+    } else {
+        for file in &images {
+            let clean = clean(kind, file, &others, limits)?;
+            out.extend(clean.map(|(extension, bytes)| numbered("image", out.len() + 1, extension, bytes)));
         }
-        Kind::MetaImage => {
-            for (i, f) in images.iter().enumerate() {
-                out.push(numbered(i + 1, "mha", metaimage::anonymous(f, &others)?));
-            }
-        }
-        Kind::Nrrd => {
-            for (i, f) in images.iter().enumerate() {
-                out.push(numbered(i + 1, "nrrd", nrrd::anonymous(f, &others)?));
-            }
-        }
-        _ => {
-            for (i, page) in pictures::pages(&images, limits)?.into_iter().enumerate() {
-                let (extension, bytes) =
-                    png::lossless(&page.pixels, page.columns, page.rows).map_err(Error::Internal)?;
-                out.push(numbered(i + 1, extension, bytes));
-            }
-        }
+    }
+    for (i, (kind, file)) in masks.iter().enumerate() {
+        let clean = clean(*kind, file, &others, limits)?;
+        out.extend(clean.map(|(extension, bytes)| numbered("mask", i + 1, extension, bytes)));
     }
     if out.is_empty() {
         return Err(Error::NoImages { files: 0 });
@@ -66,6 +51,21 @@ pub fn intake(files: Vec<NamedBytes>, limits: &Limits) -> Result<Vec<NamedBytes>
     Ok(out)
 }
 
-fn numbered(number: usize, extension: &str, bytes: Vec<u8>) -> NamedBytes {
-    NamedBytes::new(format!("image-{number:05}.{extension}"), bytes)
+/// A file of a kind without anything that could name a patient, and its extension; `None` for DICOM without an image.
+fn clean(
+    kind: Kind,
+    file: &NamedBytes,
+    others: &[&NamedBytes],
+    limits: &Limits,
+) -> Result<Option<(&'static str, Vec<u8>)>, Error> {
+    Ok(match kind {
+        Kind::Dicom => dicom::anonymous(&file.name, &file.bytes, limits)?.map(|bytes| ("dcm", bytes)),
+        Kind::Nifti => Some(("nii", nifti::anonymous(file, others)?)),
+        Kind::MetaImage => Some(("mha", metaimage::anonymous(file, others)?)),
+        _ => Some(("nrrd", nrrd::anonymous(file, others)?)),
+    })
+}
+
+fn numbered(what: &str, number: usize, extension: &str, bytes: Vec<u8>) -> NamedBytes {
+    NamedBytes::new(format!("{what}-{number:05}.{extension}"), bytes)
 }

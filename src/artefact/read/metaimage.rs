@@ -4,6 +4,7 @@
 //! it open), LPS. AnatomicalOrientation is a comment to ITK and to us.
 
 use super::archive::unzlib;
+use super::fields::{Fields, Line};
 use super::samples::{Order, Sample, grey};
 use super::volume::Volume;
 use super::{Error, Limits, NamedBytes};
@@ -32,55 +33,29 @@ const KEYS: [&str; 19] = [
     "HeaderSize",
 ];
 
-/// A header is shorter than this.
-const MAX_HEADER: usize = 64 << 10;
+struct Header<'a>(Fields<'a>);
 
-struct Header<'a> {
-    file: &'a str,
-    fields: Vec<(&'a str, &'a str)>,
-    /// Bytes after the header.
-    rest: &'a [u8],
+impl<'a> std::ops::Deref for Header<'a> {
+    type Target = Fields<'a>;
+    fn deref(&self) -> &Fields<'a> {
+        &self.0
+    }
 }
 
 impl<'a> Header<'a> {
     fn parse(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
-        let malformed = |reason: &str| Error::Malformed { file: file.to_owned(), reason: reason.to_owned() };
-        let mut fields = Vec::new();
-        let mut at = 0;
-        while at < bytes.len().min(MAX_HEADER) {
-            let line = bytes[at..].split(|b| *b == b'\n').next().unwrap_or_default();
-            at = (at + line.len() + 1).min(bytes.len());
-            let text = std::str::from_utf8(line).map_err(|_| malformed("a line of its header is no text"))?.trim();
-            if text.is_empty() {
-                continue;
+        let line = |_: usize, text: &'a str| match text.trim().split_once('=') {
+            None if text.trim().is_empty() => Line::Nothing,
+            None => Line::Foreign,
+            Some((key, value)) if key.trim() == "ElementDataFile" => {
+                Line::LastField(key.trim().to_owned(), value.trim())
             }
-            let (key, value) =
-                text.split_once('=').ok_or_else(|| malformed("a line of its header is not Key = value"))?;
-            fields.push((key.trim(), value.trim()));
-            if key.trim() == "ElementDataFile" {
-                return Ok(Self { file, fields, rest: &bytes[at..] });
-            }
+            Some((key, value)) => Line::Field(key.trim().to_owned(), value.trim()),
+        };
+        match Fields::parse(file, bytes, line)? {
+            (fields, true) => Ok(Self(fields)),
+            (fields, false) => Err(fields.malformed("its header names no ElementDataFile")),
         }
-        Err(malformed("its header names no ElementDataFile"))
-    }
-    fn get(&self, key: &str) -> Option<&'a str> {
-        self.fields.iter().find(|(k, _)| *k == key).map(|(_, v)| *v)
-    }
-    fn any(&self, keys: &[&str]) -> Option<&'a str> {
-        keys.iter().find_map(|k| self.get(k))
-    }
-    fn malformed(&self, reason: impl Into<String>) -> Error {
-        Error::Malformed { file: self.file.to_owned(), reason: reason.into() }
-    }
-    fn unsupported(&self, reason: impl Into<String>) -> Error {
-        Error::Unsupported { file: self.file.to_owned(), reason: reason.into() }
-    }
-    fn numbers<const N: usize>(&self, key: &str, text: &str) -> Result<[f64; N], Error> {
-        let parsed: Option<Vec<f64>> =
-            text.split_whitespace().map(|t| t.parse().ok().filter(|x: &f64| x.is_finite())).collect();
-        parsed
-            .and_then(|v| <[f64; N]>::try_from(v).ok())
-            .ok_or_else(|| self.malformed(format!("{key} does not hold {N} numbers")))
     }
     fn truth(&self, keys: &[&str]) -> bool {
         self.any(keys).is_some_and(|v| v.eq_ignore_ascii_case("true") || v == "1")
@@ -88,18 +63,6 @@ impl<'a> Header<'a> {
     /// The data file's name, unless the data follows the header.
     fn data_file(&self) -> Option<&'a str> {
         self.get("ElementDataFile").filter(|name| !name.eq_ignore_ascii_case("LOCAL"))
-    }
-    /// The bytes of the image, compressed or not, HeaderSize not yet skipped.
-    fn data<'b>(&self, companions: &[&'b NamedBytes]) -> Result<&'b [u8], Error>
-    where
-        'a: 'b,
-    {
-        let Some(name) = self.data_file() else { return Ok(self.rest) };
-        if name.starts_with("LIST") || name.contains('%') {
-            return Err(self.unsupported("one data file per slice is not read; save the volume as one .mha file"));
-        }
-        companion(companions, name)
-            .ok_or_else(|| self.malformed("the data file that its header names was not sent with it"))
     }
     fn sample(&self) -> Result<Sample, Error> {
         match self.get("ElementType").unwrap_or_default() {
@@ -121,11 +84,7 @@ impl<'a> Header<'a> {
         if dims != 3.0 {
             return Err(self.unsupported(format!("it has {dims} dimensions; a volume of 3 is needed")));
         }
-        let size = self.numbers::<3>("DimSize", self.get("DimSize").unwrap_or_default())?;
-        if size.iter().any(|n| *n < 1.0 || *n > 1e9 || n.fract() != 0.0) {
-            return Err(self.malformed(format!("DimSize is {size:?}")));
-        }
-        Ok(size.map(|n| n as u64))
+        self.0.size("DimSize")
     }
     fn geometry(&self) -> Result<([V3; 3], P3, Vec<Warning>), Error> {
         let Some(spacing) = self.any(&["ElementSpacing", "ElementSize"]) else {
@@ -155,12 +114,6 @@ impl<'a> Header<'a> {
     }
 }
 
-/// A file by the last part of its name.
-pub(crate) fn companion<'b>(files: &[&'b NamedBytes], name: &str) -> Option<&'b [u8]> {
-    let base = |n: &str| n.rsplit(['/', '\\']).next().unwrap_or_default().to_owned();
-    files.iter().find(|f| base(&f.name) == base(name)).map(|f| f.bytes.as_slice())
-}
-
 /// The name of the data file that a header refers to; `None` when the data follows the header.
 pub(crate) fn data_file(file: &NamedBytes) -> Option<String> {
     Header::parse(&file.name, &file.bytes).ok()?.data_file().map(str::to_owned)
@@ -188,7 +141,7 @@ pub(crate) fn volume(
     let count = limits.admit(&file.name, size[0], size[1], size[2])?;
     let needed = count as u64 * sample.bytes() as u64;
     let (steps, origin, warnings) = h.geometry()?;
-    let data = h.data(companions)?;
+    let data = h.data(h.data_file(), companions)?;
     let inflated;
     let data = if h.truth(&["CompressedData"]) {
         inflated = unzlib(&file.name, data, needed, limits)?;
@@ -213,12 +166,12 @@ pub(crate) fn volume(
 /// As [`volume`] for headers that cannot be parsed or whose data file is absent.
 pub(crate) fn anonymous(file: &NamedBytes, companions: &[&NamedBytes]) -> Result<Vec<u8>, Error> {
     let h = Header::parse(&file.name, &file.bytes)?;
-    let data = h.data(companions)?;
+    let data = h.data(h.data_file(), companions)?;
     let mut out = String::new();
     for (key, value) in &h.fields {
         let word =
             |t: &str| t.parse::<f64>().is_ok() || t.starts_with("MET_") || ["True", "False", "Image"].contains(&t);
-        if KEYS.contains(key) && value.split_whitespace().all(word) {
+        if KEYS.contains(&key.as_str()) && value.split_whitespace().all(word) {
             out += &format!("{key} = {value}\n");
         }
     }

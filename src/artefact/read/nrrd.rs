@@ -1,7 +1,7 @@
 //! NRRD (teem.sourceforge.net/nrrd/format.html): three axes, raw or gzip, attached or one data file.
 
 use super::archive::gunzip;
-use super::metaimage::companion;
+use super::fields::{Fields, Line};
 use super::samples::{Order, Sample, grey};
 use super::volume::Volume;
 use super::{Error, Limits, NamedBytes};
@@ -21,72 +21,29 @@ const FIELDS: [&str; 10] = [
     "encoding",
 ];
 
-/// A header is shorter than this.
-const MAX_HEADER: usize = 64 << 10;
+struct Header<'a>(Fields<'a>);
 
-struct Header<'a> {
-    file: &'a str,
-    fields: Vec<(String, &'a str)>,
-    rest: &'a [u8],
+impl<'a> std::ops::Deref for Header<'a> {
+    type Target = Fields<'a>;
+    fn deref(&self) -> &Fields<'a> {
+        &self.0
+    }
 }
 
 impl<'a> Header<'a> {
     fn parse(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
-        let malformed = |reason: &str| Error::Malformed { file: file.to_owned(), reason: reason.to_owned() };
-        let mut fields = Vec::new();
-        let mut at = 0;
-        let mut first = true;
-        while at < bytes.len().min(MAX_HEADER) {
-            let line = bytes[at..].split(|b| *b == b'\n').next().unwrap_or_default();
-            at = (at + line.len() + 1).min(bytes.len());
-            let text = String::from_utf8_lossy(line);
-            if text.trim().is_empty() {
-                return Ok(Self { file, fields, rest: &bytes[at..] });
-            }
-            // comments, key/value pairs and the magic are not fields
-            if std::mem::take(&mut first) || text.starts_with('#') || text.contains(":=") {
-                continue;
-            }
-            let line = std::str::from_utf8(line).map_err(|_| malformed("a line of its header is no text"))?;
-            let (key, value) = line.split_once(": ").ok_or_else(|| malformed("a line of its header is no field"))?;
-            fields.push((key.trim().to_ascii_lowercase(), value.trim()));
-        }
+        let line = |number: usize, text: &'a str| match text.split_once(": ") {
+            // the magic, comments and key/value pairs are not fields
+            _ if number == 0 || text.starts_with('#') || text.contains(":=") => Line::Nothing,
+            _ if text.trim().is_empty() => Line::End,
+            Some((key, value)) => Line::Field(key.trim().to_ascii_lowercase(), value.trim()),
+            None => Line::Foreign,
+        };
         // a detached header may end without an empty line
-        Ok(Self { file, fields, rest: &[] })
-    }
-    fn get(&self, key: &str) -> Option<&'a str> {
-        self.fields.iter().find(|(k, _)| k == key).map(|(_, v)| *v)
-    }
-    fn malformed(&self, reason: impl Into<String>) -> Error {
-        Error::Malformed { file: self.file.to_owned(), reason: reason.into() }
-    }
-    fn unsupported(&self, reason: impl Into<String>) -> Error {
-        Error::Unsupported { file: self.file.to_owned(), reason: reason.into() }
+        Ok(Self(Fields::parse(file, bytes, line)?.0))
     }
     fn data_file(&self) -> Option<&'a str> {
         self.get("data file").or_else(|| self.get("datafile"))
-    }
-    fn data<'b>(&self, companions: &[&'b NamedBytes]) -> Result<&'b [u8], Error>
-    where
-        'a: 'b,
-    {
-        let Some(name) = self.data_file() else { return Ok(self.rest) };
-        if name.starts_with("LIST") || name.contains('%') {
-            return Err(self.unsupported("one data file per slice is not read; save the volume as one .nrrd file"));
-        }
-        companion(companions, name)
-            .ok_or_else(|| self.malformed("the data file that its header names was not sent with it"))
-    }
-    fn triple(&self, key: &str, text: &str) -> Result<[f64; 3], Error> {
-        let inner = text.trim().trim_start_matches('(').trim_end_matches(')');
-        let parsed: Option<Vec<f64>> = inner
-            .split([',', ' '])
-            .filter(|t| !t.is_empty())
-            .map(|t| t.parse().ok().filter(|x: &f64| x.is_finite()))
-            .collect();
-        parsed
-            .and_then(|v| <[f64; 3]>::try_from(v).ok())
-            .ok_or_else(|| self.malformed(format!("{key} does not hold 3 numbers")))
     }
     fn sample(&self) -> Result<Sample, Error> {
         match self.get("type").unwrap_or_default() {
@@ -96,8 +53,16 @@ impl<'a> Header<'a> {
             "ushort" | "unsigned short" | "unsigned short int" | "uint16" | "uint16_t" => Ok(Sample::Unsigned(2)),
             "int" | "signed int" | "int32" | "int32_t" => Ok(Sample::Signed(4)),
             "uint" | "unsigned int" | "uint32" | "uint32_t" => Ok(Sample::Unsigned(4)),
-            "longlong" | "long long" | "int64" | "int64_t" => Ok(Sample::Signed(8)),
-            "ulonglong" | "unsigned long long" | "uint64" | "uint64_t" => Ok(Sample::Unsigned(8)),
+            "longlong"
+            | "long long"
+            | "long long int"
+            | "signed long long"
+            | "signed long long int"
+            | "int64"
+            | "int64_t" => Ok(Sample::Signed(8)),
+            "ulonglong" | "unsigned long long" | "unsigned long long int" | "uint64" | "uint64_t" => {
+                Ok(Sample::Unsigned(8))
+            }
             "float" => Ok(Sample::Float),
             "double" => Ok(Sample::Double),
             _ => Err(self.unsupported("its type is not read; save it as short or float")),
@@ -107,7 +72,7 @@ impl<'a> Header<'a> {
         if self.get("dimension") != Some("3") {
             return Err(self.unsupported("it does not have 3 dimensions; send one grey volume"));
         }
-        let size = self.triple("sizes", self.get("sizes").unwrap_or_default())?;
+        let size = self.numbers("sizes", self.get("sizes").unwrap_or_default())?;
         if size.iter().any(|n| *n < 1.0 || *n > 1e9 || n.fract() != 0.0) {
             return Err(self.malformed(format!("sizes are {size:?}")));
         }
@@ -115,14 +80,14 @@ impl<'a> Header<'a> {
     }
     fn geometry(&self) -> Result<([V3; 3], P3, Vec<Warning>), Error> {
         let mut warnings = Vec::new();
-        let origin = self.get("space origin").map_or(Ok([0.0; 3]), |t| self.triple("space origin", t))?;
+        let origin = self.get("space origin").map_or(Ok([0.0; 3]), |t| self.numbers("space origin", t))?;
         if let Some(text) = self.get("space directions") {
             // each axis' vector in parentheses
             let parts: Vec<&str> = text.split(')').map(str::trim).filter(|t| !t.is_empty()).collect();
             let [a, b, c] = parts[..] else { return Err(self.malformed("space directions does not hold 3 vectors")) };
             let sign = self.space()?;
             let lps = |t: [f64; 3]| [sign[0] * t[0] + 0.0, sign[1] * t[1] + 0.0, sign[2] * t[2] + 0.0];
-            let step = |t: &str| Ok::<_, Error>(V3::from(lps(self.triple("space directions", t)?)));
+            let step = |t: &str| Ok::<_, Error>(V3::from(lps(self.numbers("space directions", t)?)));
             return Ok(([step(a)?, step(b)?, step(c)?], P3::from(lps(origin)), warnings));
         }
         let Some(text) = self.get("spacings") else {
@@ -132,7 +97,7 @@ impl<'a> Header<'a> {
         };
         let message = "no space directions: the axes of the volume are taken as those of the patient (LPS)";
         warnings.push(Warning::new("nrrd.no_orientation", message, Place::file(self.file)));
-        let s = self.triple("spacings", text)?;
+        let s: [f64; 3] = self.numbers("spacings", text)?;
         Ok(([V3::X * s[0], V3::Y * s[1], V3::Z * s[2]], P3::from(origin), warnings))
     }
     /// Signs that turn the file's space into LPS.
@@ -169,7 +134,7 @@ pub(crate) fn volume(
     let size = h.size()?;
     let count = limits.admit(&file.name, size[0], size[1], size[2])?;
     let (steps, origin, warnings) = h.geometry()?;
-    let data = h.data(companions)?;
+    let data = h.data(h.data_file(), companions)?;
     let inflated;
     let data = match h.get("encoding").unwrap_or_default() {
         "raw" => data,
@@ -200,7 +165,7 @@ pub(crate) fn anonymous(file: &NamedBytes, companions: &[&NamedBytes]) -> Result
     if h.get("space directions").is_some() {
         h.space()?;
     }
-    let data = h.data(companions)?;
+    let data = h.data(h.data_file(), companions)?;
     let mut out = String::from("NRRD0004\n");
     for (key, value) in &h.fields {
         let numeric = value.bytes().all(|b| b.is_ascii_digit() || b" ().,+-eE".contains(&b));

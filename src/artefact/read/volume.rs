@@ -74,26 +74,10 @@ pub(crate) fn orthonormal(u: V3, v: V3) -> Result<[V3; 2], f64> {
 /// [`Error::TooFewSlices`], [`Error::DuplicatePosition`], [`Error::GantryTilt`], [`Error::Geometry`],
 /// [`Error::TooLarge`].
 pub(crate) fn place(mut slices: Vec<Placed>, frame: &Frame, limits: &Limits) -> Result<Placement, Error> {
-    if slices.len() < MIN_SLICES {
-        return Err(Error::TooFewSlices { found: slices.len(), needed: MIN_SLICES });
-    }
-    let name = slices[0].source.clone();
-    let total = limits.admit(&name, frame.columns as u64, frame.rows as u64, slices.len() as u64)?;
-    check_frame(&name, frame)?;
+    let offsets = line_up(&mut slices, frame)?;
+    let total = limits.admit(&slices[0].source, frame.columns as u64, frame.rows as u64, slices.len() as u64)?;
     let [u, v] = frame.directions;
-    let normal = u.cross(v);
-    if let Some(bad) = slices.iter().find(|s| !s.origin.is_finite()) {
-        let reason = "its position is not a finite number".to_owned();
-        return Err(Error::Geometry { file: bad.source.clone(), reason });
-    }
-    slices.sort_by(|a, b| {
-        let along = |p: &Placed| p.origin.raw().dot(normal.raw());
-        along(a).total_cmp(&along(b)).then_with(|| a.source.cmp(&b.source))
-    });
-    let first = slices[0].origin;
-    let offsets: Vec<f64> = slices.iter().map(|s| (s.origin - first).dot(normal)).collect();
-    refuse_duplicates(&slices, &offsets)?;
-    refuse_tilt(&slices, &offsets, frame)?;
+    let (first, normal) = (slices[0].origin, u.cross(v));
     let (missing, warnings) = gaps(&offsets);
     let mut pixels = Vec::with_capacity(total);
     for s in &mut slices {
@@ -113,6 +97,33 @@ pub(crate) fn place(mut slices: Vec<Placed>, frame: &Frame, limits: &Limits) -> 
         thickness_mm: frame.thickness_mm,
     };
     Ok(Placement { stack, missing, warnings })
+}
+
+/// Sort slices along the normal; their offsets from the first, mm. Pixels are not looked at.
+///
+/// # Errors
+/// [`Error::TooFewSlices`], [`Error::DuplicatePosition`], [`Error::GantryTilt`], [`Error::Geometry`].
+pub(crate) fn line_up(slices: &mut [Placed], frame: &Frame) -> Result<Vec<f64>, Error> {
+    if slices.len() < MIN_SLICES {
+        return Err(Error::TooFewSlices { found: slices.len(), needed: MIN_SLICES });
+    }
+    let name = slices[0].source.clone();
+    check_frame(&name, frame)?;
+    let [u, v] = frame.directions;
+    let normal = u.cross(v);
+    if let Some(bad) = slices.iter().find(|s| !s.origin.is_finite()) {
+        let reason = "its position is not a finite number".to_owned();
+        return Err(Error::Geometry { file: bad.source.clone(), reason });
+    }
+    slices.sort_by(|a, b| {
+        let along = |p: &Placed| p.origin.raw().dot(normal.raw());
+        along(a).total_cmp(&along(b)).then_with(|| a.source.cmp(&b.source))
+    });
+    let first = slices[0].origin;
+    let offsets: Vec<f64> = slices.iter().map(|s| (s.origin - first).dot(normal)).collect();
+    refuse_duplicates(slices, &offsets)?;
+    refuse_tilt(slices, &offsets, frame)?;
+    Ok(offsets)
 }
 
 fn check_frame(file: &str, frame: &Frame) -> Result<(), Error> {

@@ -32,7 +32,7 @@ pub(crate) fn anonymous(name: &str, bytes: &[u8], limits: &Limits) -> Result<Opt
     elements.retain(|e| ![SOP_CLASS, SOP_INSTANCE, PIXEL_DATA].contains(&e.tag));
     elements.push(Element::text(SOP_CLASS, b"UI", class));
     elements.push(Element::text(SOP_INSTANCE, b"UI", &instance));
-    let vr = if matches!(pixels, Content::Fragments(_)) || opened.ds.short(BITS_ALLOCATED) == Some(8) {
+    let vr = if matches!(pixels, Content::Fragments(_)) || opened.ds.short(BITS_ALLOCATED).is_some_and(|b| b <= 8) {
         b"OB"
     } else {
         b"OW"

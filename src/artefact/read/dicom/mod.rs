@@ -3,15 +3,20 @@
 //! Slices are ordered by ImagePositionPatient along the normal; InstanceNumber, SliceLocation, SpacingBetweenSlices and
 //! SliceThickness never place a slice. The rescale is applied per frame; windows are not (they are for the eye).
 //! MONOCHROME1 values are kept as stored, with a warning: only the display is inverted, the physics is not. Several
-//! series in one upload: the one with most slices is taken and said; two of equal length are refused, because choosing
-//! between them would be a guess.
+//! series in one upload: the one that the plan names, else the longest that makes a stack, is taken and said; two of
+//! equal length are refused, because choosing between them would be a guess.
 
 mod anonymous;
 pub(crate) mod dataset;
+mod jpegls;
 mod pixels;
+mod rle;
+mod segments;
+mod series;
 pub(crate) mod table;
 
 pub(crate) use anonymous::anonymous;
+pub(crate) use segments::{is_segmentation, labels};
 
 use super::report::Acquisition;
 use super::volume::{Frame, Placed, Placement, orthonormal, place};
@@ -21,9 +26,6 @@ use pixels::{Layout, Syntax};
 use space::{P3, Place, V3, Warning};
 use std::borrow::Cow;
 use table::*;
-
-/// Slices whose directions differ by more than this angle (radians) are no stack; printed directions differ by 1e-6.
-const SAME_DIRECTION: f64 = 2e-3;
 
 /// Explicit little endian, as deflated data sets are.
 const EXPLICIT: Encoding = Encoding { explicit: true, order: super::samples::Order::Little };
@@ -84,7 +86,8 @@ struct Slice {
     file: usize,
     frame: usize,
     source: String,
-    series: String,
+    /// SeriesInstanceUID and SeriesNumber.
+    series: [String; 2],
     size: [usize; 2],
     plane: Option<PlaneOf>,
     rescale: (f64, f64),
@@ -100,23 +103,15 @@ struct PlaneOf {
     spacing: [f64; 2],
 }
 
-impl PlaneOf {
-    fn parallel(&self, other: &Self) -> bool {
-        (0..2).all(|a| self.directions[a].angle_to(other.directions[a]) < SAME_DIRECTION)
-    }
-    /// A key that does not depend on file order or names.
-    fn key(&self) -> [f64; 9] {
-        let [u, v] = self.directions.map(V3::to_array);
-        let o = self.origin.to_array();
-        [u[0], u[1], u[2], v[0], v[1], v[2], o[0], o[1], o[2]]
-    }
-}
-
-/// The stack in some DICOM files.
+/// The stack in some DICOM files; `series` names one of several by SeriesNumber or SeriesInstanceUID.
 ///
 /// # Errors
 /// See [`Error`]; `input.unequal_sizes`, `stack.duplicate_position`, `dicom.gantry_tilt` name the files.
-pub(crate) fn stack(files: &[NamedBytes], limits: &Limits) -> Result<(Placement, Acquisition), Error> {
+pub(crate) fn stack(
+    files: &[NamedBytes],
+    series: Option<&str>,
+    limits: &Limits,
+) -> Result<(Placement, Acquisition), Error> {
     let mut warnings = Vec::new();
     let mut slices = Vec::new();
     let mut colour = None;
@@ -140,8 +135,7 @@ pub(crate) fn stack(files: &[NamedBytes], limits: &Limits) -> Result<(Placement,
     if slices.is_empty() {
         return Err(colour.unwrap_or(Error::NoImages { files: files.len() }));
     }
-    let group = longest(slices, &mut warnings)?;
-    refuse_unequal(&group)?;
+    let group = series::chosen(slices, series, &mut warnings)?;
     if group[0].inverted {
         let message = "MONOCHROME1: what looks bright on the screen is dark in the values, which are used as stored";
         warnings.push(Warning::new("dicom.monochrome1", message, Place::none()));
@@ -178,7 +172,7 @@ fn headers(index: usize, file: &str, ds: &DataSet, layout: &Layout) -> Result<Ve
                 file: index,
                 frame,
                 source,
-                series: ds.text(SERIES).unwrap_or_default().to_owned(),
+                series: [SERIES, SERIES_NUMBER].map(|t| ds.text(t).unwrap_or_default().to_owned()),
                 size: [layout.rows, layout.columns],
                 plane: if placed { plane(file, ds, frame)? } else { None },
                 rescale: rescale(file, one(PIXEL_VALUE_SEQUENCE, SLOPE), one(PIXEL_VALUE_SEQUENCE, INTERCEPT))?,
@@ -225,74 +219,11 @@ fn plane(file: &str, ds: &DataSet, frame: usize) -> Result<Option<PlaneOf>, Erro
     Ok(Some(PlaneOf { origin: P3::new(x, y, z), directions, spacing: [row, column] }))
 }
 
-/// The slices of the longest series of one orientation, in an order that does not depend on the files' order.
-fn longest(mut slices: Vec<Slice>, warnings: &mut Vec<Warning>) -> Result<Vec<Slice>, Error> {
-    let unplaced = slices.iter().filter(|s| s.plane.is_none()).count();
-    if 2 * unplaced > slices.len() {
-        let file = slices.iter().find(|s| s.plane.is_none()).map(|s| s.source.clone());
-        let reason = "the file has no ImagePositionPatient, ImageOrientationPatient or PixelSpacing; export the original \
-                      images, not secondary captures";
-        return Err(Error::GeometryMissing { file, field: "geometry.pixel_spacing_mm", reason: reason.to_owned() });
-    }
-    let total = slices.len();
-    slices.retain(|s| s.plane.is_some());
-    let key = |s: &Slice| s.plane.map_or([0.0; 9], |p| p.key());
-    slices.sort_by(|a, b| {
-        let order = |x: &[f64; 9], y: &[f64; 9]| {
-            x.iter().zip(y).map(|(p, q)| p.total_cmp(q)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
-        };
-        order(&key(a), &key(b)).then_with(|| a.series.cmp(&b.series)).then_with(|| a.source.cmp(&b.source))
-    });
-    let mut groups: Vec<Vec<Slice>> = Vec::new();
-    for s in slices {
-        let same = |g: &&mut Vec<Slice>| {
-            g[0].series == s.series && g[0].plane.zip(s.plane).is_some_and(|(a, b)| a.parallel(&b))
-        };
-        match groups.iter_mut().find(same) {
-            Some(group) => group.push(s),
-            None => groups.push(vec![s]),
-        }
-    }
-    let most = groups.iter().map(Vec::len).max().unwrap_or(0);
-    let mut best: Vec<Vec<Slice>> = groups.into_iter().filter(|g| g.len() == most).collect();
-    if best.len() > 1 {
-        let (a, b) = (&best[0][0], &best[1][0]);
-        return Err(Error::AmbiguousSeries { first: a.source.clone(), second: b.source.clone(), slices: most });
-    }
-    let group = best.pop().ok_or_else(|| Error::Internal("no group of slices".to_owned()))?;
-    if group.len() < total {
-        let message = format!(
-            "{} of {total} images belong to the longest series of one orientation and were taken; the others were left out",
-            group.len()
-        );
-        warnings.push(Warning::new("dicom.several_series", message, Place::none()));
-    }
-    Ok(group)
-}
-
-/// All slices have the size and the spacing of the majority.
-fn refuse_unequal(group: &[Slice]) -> Result<(), Error> {
-    let spacing = |s: &Slice| s.plane.map_or([0.0; 2], |p| p.spacing);
-    let same = |a: &Slice, b: &Slice| {
-        let (p, q) = (spacing(a), spacing(b));
-        // 1e-4: over 512 pixels a twentieth of a pixel
-        a.size == b.size && (0..2).all(|i| (p[i] - q[i]).abs() <= 1e-4 * p[i].abs())
-    };
-    let in_words = |s: &Slice| {
-        let [row, column] = spacing(s);
-        format!("{} x {}, step {row} x {column}", s.size[0], s.size[1])
-    };
-    let Some(odd) = group.iter().find(|s| !same(&group[0], s)) else { return Ok(()) };
-    let like_first = group.iter().filter(|s| same(&group[0], s)).count();
-    let (found, expected) = if 2 * like_first >= group.len() { (odd, &group[0]) } else { (&group[0], odd) };
-    Err(Error::UnequalSizes { file: found.source.clone(), found: in_words(found), expected: in_words(expected) })
-}
-
 /// The pixels of the chosen slices, file by file.
 fn decoded(group: &[Slice], files: &[NamedBytes], limits: &Limits) -> Result<Placement, Error> {
     let first = &group[0];
-    let plane = first.plane.ok_or_else(|| Error::Internal("a slice without a plane".to_owned()))?;
-    let [rows, columns] = first.size;
+    let (frame, plane) = series::frame(first)?;
+    let Frame { columns, rows, .. } = frame;
     limits.admit(&first.source, columns as u64, rows as u64, group.len() as u64)?;
     let mut order: Vec<&Slice> = group.iter().collect();
     order.sort_by_key(|s| (s.file, s.frame));
@@ -309,6 +240,5 @@ fn decoded(group: &[Slice], files: &[NamedBytes], limits: &Limits) -> Result<Pla
             placed.push(Placed { source: s.source.clone(), origin, pixels });
         }
     }
-    let thickness_mm = first.facts.thickness_mm;
-    place(placed, &Frame { columns, rows, spacing: plane.spacing, directions: plane.directions, thickness_mm }, limits)
+    place(placed, &frame, limits)
 }

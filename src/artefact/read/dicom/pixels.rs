@@ -5,6 +5,7 @@ use super::table::{
     BITS_ALLOCATED, BITS_STORED, COLUMNS, FRAMES, HIGH_BIT, PHOTOMETRIC, PIXEL_DATA, PIXEL_REPRESENTATION, ROWS,
     SAMPLES_PER_PIXEL,
 };
+use super::{jpegls, rle};
 use crate::read::samples::Order;
 use crate::read::{Error, Limits};
 use dicom_core::value::{PixelFragmentSequence, PrimitiveValue};
@@ -21,9 +22,13 @@ pub(crate) enum Syntax {
     Native(Encoding),
     /// Plain samples in a deflated data set.
     Deflated,
-    /// Fragments of RLE, JPEG or JPEG 2000.
+    /// Fragments of RLE, JPEG, JPEG-LS or JPEG 2000.
     Encapsulated,
 }
+
+const JPEG_LS: &str = "1.2.840.10008.1.2.4.80";
+const JPEG_LS_NEAR: &str = "1.2.840.10008.1.2.4.81";
+const RLE: &str = "1.2.840.10008.1.2.5";
 
 /// The syntax of a transfer syntax UID.
 ///
@@ -36,18 +41,20 @@ pub(crate) fn syntax(file: &str, uid: &str) -> Result<Syntax, Error> {
         "1.2.840.10008.1.2.1" => native(true, Order::Little),
         "1.2.840.10008.1.2.1.99" => Ok(Syntax::Deflated),
         "1.2.840.10008.1.2.2" => native(true, Order::Big),
-        // JPEG baseline, extended, lossless (two), JPEG 2000 lossless and lossy, RLE
+        // JPEG baseline, extended, lossless (two), JPEG-LS and JPEG 2000 lossless and lossy, RLE
         "1.2.840.10008.1.2.4.50"
         | "1.2.840.10008.1.2.4.51"
         | "1.2.840.10008.1.2.4.57"
         | "1.2.840.10008.1.2.4.70"
+        | JPEG_LS
+        | JPEG_LS_NEAR
         | "1.2.840.10008.1.2.4.90"
         | "1.2.840.10008.1.2.4.91"
-        | "1.2.840.10008.1.2.5" => Ok(Syntax::Encapsulated),
+        | RLE => Ok(Syntax::Encapsulated),
         other => {
             let shown: String = other.chars().filter(|c| c.is_ascii_digit() || *c == '.').take(64).collect();
             let reason = format!(
-                "transfer syntax {shown} is not read; export uncompressed, RLE, JPEG lossless or JPEG 2000 instead"
+                "transfer syntax {shown} is not read; export uncompressed, RLE, JPEG lossless, JPEG-LS or JPEG 2000 instead"
             );
             Err(Error::Unsupported { file: file.to_owned(), reason })
         }
@@ -87,8 +94,8 @@ impl Layout {
         let allocated = short(BITS_ALLOCATED, "BitsAllocated")?;
         let stored = ds.short(BITS_STORED).unwrap_or(allocated);
         let high_bit = ds.short(HIGH_BIT).unwrap_or(stored.saturating_sub(1));
-        if ![8, 16, 32].contains(&allocated) {
-            let reason = format!("{allocated} bits per pixel are not read; 8, 16 and 32 are");
+        if ![1, 8, 16, 32].contains(&allocated) {
+            let reason = format!("{allocated} bits per pixel are not read; 1, 8, 16 and 32 are");
             return Err(Error::Unsupported { file: file.to_owned(), reason });
         }
         if stored == 0 || stored > allocated || high_bit >= allocated || high_bit + 1 < stored {
@@ -106,8 +113,9 @@ impl Layout {
         })
     }
 
-    fn frame_bytes(&self) -> usize {
-        self.rows * self.columns * usize::from(self.allocated / 8)
+    /// Bytes of all frames; single bits are packed across rows and frames (PS3.5 8.2).
+    fn bytes(&self) -> usize {
+        (self.frames * self.rows * self.columns * usize::from(self.allocated)).div_ceil(8)
     }
 
     /// The value of one little-endian sample: bits low to high, other bits (old overlays) masked, sign extended.
@@ -130,11 +138,17 @@ impl Layout {
         frame: usize,
         (slope, intercept): (f64, f64),
     ) -> Result<Vec<f32>, Error> {
-        let size = self.frame_bytes();
-        let Some(bytes) = samples.get(frame * size..(frame + 1) * size) else {
-            let (needed, found) = ((self.frames * size) as u64, samples.len() as u64);
+        let count = self.rows * self.columns;
+        let size = count * usize::from(self.allocated / 8);
+        if samples.len() < self.bytes() || frame >= self.frames {
+            let (needed, found) = (self.bytes() as u64, samples.len() as u64);
             return Err(Error::Truncated { file: file.to_owned(), what: "the pixel data", needed, found });
-        };
+        }
+        if self.allocated == 1 {
+            let bit = |i: usize| f64::from(samples[i / 8] >> (i % 8) & 1);
+            return Ok((frame * count..(frame + 1) * count).map(|i| (slope * bit(i) + intercept) as f32).collect());
+        }
+        let bytes = &samples[frame * size..(frame + 1) * size];
         let width = usize::from(self.allocated / 8);
         Ok(bytes.chunks_exact(width).map(|s| (slope * self.value(s) + intercept) as f32).collect())
     }
@@ -146,7 +160,7 @@ impl Layout {
 /// [`Error::Truncated`] without (whole) pixel data, [`Error::Unsupported`] or [`Error::Malformed`] when a compressed
 /// frame cannot be decoded.
 pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layout) -> Result<Cow<'a, [u8]>, Error> {
-    let needed = (layout.frames * layout.frame_bytes()) as u64;
+    let needed = layout.bytes() as u64;
     match ds.elements.get(&PIXEL_DATA) {
         Some(Value::Bytes(bytes, vr)) => {
             if (bytes.len() as u64) < needed {
@@ -156,7 +170,7 @@ pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layo
             let word = match ds.order {
                 Order::Little => 1,
                 // 8-bit pixels in 16-bit words are swapped with the words
-                Order::Big if layout.allocated == 8 && *vr != Some(*b"OW") => 1,
+                Order::Big if layout.allocated <= 8 && *vr != Some(*b"OW") => 1,
                 Order::Big => usize::from(layout.allocated / 8).max(2),
             };
             if word == 1 {
@@ -173,6 +187,15 @@ pub(crate) fn samples<'a>(file: &str, ds: &DataSet<'a>, uid: &str, layout: &Layo
 /// (a decoder allocates by that) and a guard against panics of the decoders.
 fn decoded(file: &str, fragments: &[&[u8]], uid: &str, layout: &Layout) -> Result<Vec<u8>, Error> {
     let malformed = |reason: String| Error::Malformed { file: file.to_owned(), reason };
+    if layout.allocated == 1 {
+        let reason = "compressed single bits are not read; export it uncompressed".to_owned();
+        return Err(Error::Unsupported { file: file.to_owned(), reason });
+    }
+    match uid {
+        JPEG_LS | JPEG_LS_NEAR => return jpeg_ls(fragments, layout).map_err(malformed),
+        RLE => return run_lengths(fragments, layout).map_err(malformed),
+        _ => {}
+    }
     for (columns, rows) in fragments.iter().skip(1).filter_map(|f| stream_size(f)) {
         if (columns as usize, rows as usize) != (layout.columns, layout.rows) {
             let stated = format!("{} x {}", layout.columns, layout.rows);
@@ -198,6 +221,62 @@ fn decoded(file: &str, fragments: &[&[u8]], uid: &str, layout: &Layout) -> Resul
         return Err(malformed(format!("{bits} bits per pixel come out where {} are stated", layout.allocated)));
     }
     Ok(decoded.into_data())
+}
+
+/// Run-length coded frames as little-endian samples.
+fn run_lengths(fragments: &[&[u8]], layout: &Layout) -> Result<Vec<u8>, String> {
+    let (pixels, width) = (layout.rows * layout.columns, usize::from(layout.allocated / 8));
+    let mut out = Vec::new();
+    for frame in frames(fragments, layout.frames)? {
+        out.append(&mut rle::decode(&frame, pixels, width)?);
+    }
+    Ok(out)
+}
+
+/// JPEG-LS frames as little-endian samples.
+fn jpeg_ls(fragments: &[&[u8]], layout: &Layout) -> Result<Vec<u8>, String> {
+    let mut out = Vec::new();
+    for stream in frames(fragments, layout.frames)? {
+        let frame = jpegls::decode(&stream, layout.columns, layout.rows)?;
+        match layout.allocated {
+            8 if frame.precision <= 8 => out.extend(frame.samples.iter().map(|&s| s as u8)),
+            16 => out.extend(frame.samples.iter().flat_map(|s| s.to_le_bytes())),
+            bits => return Err(format!("{} bits per pixel come out where {bits} are stated", frame.precision)),
+        }
+    }
+    Ok(out)
+}
+
+/// The code streams of all frames: one fragment each, or all fragments of a single frame, or by the offset table (byte
+/// offsets of the frames' first fragments, item headers of 8 bytes counted; PS3.5 A.4).
+fn frames<'a>(fragments: &[&'a [u8]], count: usize) -> Result<Vec<Cow<'a, [u8]>>, String> {
+    let Some((table, pieces)) = fragments.split_first() else { return Err("it holds no fragment".to_owned()) };
+    if pieces.len() == count {
+        return Ok(pieces.iter().map(|p| Cow::Borrowed(*p)).collect());
+    }
+    if count == 1 {
+        return Ok(vec![Cow::Owned(pieces.concat())]);
+    }
+    let offsets: Vec<u64> =
+        table.chunks_exact(4).map(|b| u64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect();
+    if offsets.len() != count {
+        return Err(format!("{} fragments for {count} frames and no offset table", pieces.len()));
+    }
+    let mut out: Vec<Vec<u8>> = Vec::new();
+    let mut at = 0;
+    for piece in pieces {
+        if offsets.get(out.len()) == Some(&at) {
+            out.push(Vec::new());
+        }
+        let Some(last) = out.last_mut() else { return Err("its offset table is damaged".to_owned()) };
+        last.extend(*piece);
+        at += 8 + piece.len() as u64;
+    }
+    if out.len() == count {
+        Ok(out.into_iter().map(Cow::Owned).collect())
+    } else {
+        Err("its offset table is damaged".to_owned())
+    }
 }
 
 fn encapsulated(

@@ -38,10 +38,13 @@ pub(crate) const PIXEL_MEASURES_SEQUENCE: Tag = 0x0028_9110;
 pub(crate) const PIXEL_VALUE_SEQUENCE: Tag = 0x0028_9145;
 pub(crate) const SHARED_GROUPS: Tag = 0x5200_9229;
 pub(crate) const PER_FRAME_GROUPS: Tag = 0x5200_9230;
+pub(crate) const SEGMENT_IDENTIFICATION: Tag = 0x0062_000a;
+pub(crate) const REFERENCED_SEGMENT: Tag = 0x0062_000b;
+pub(crate) const MAXIMUM_FRACTION: Tag = 0x0062_000e;
 pub(crate) const PIXEL_DATA: Tag = 0x7fe0_0010;
 
 /// Allowed elements with their value representation, ascending.
-const ALLOWED: [(Tag, &[u8; 2]); 44] = [
+const ALLOWED: [(Tag, &[u8; 2]); 47] = [
     (SOP_CLASS, b"UI"),
     (SOP_INSTANCE, b"UI"),
     (MODALITY, b"CS"),
@@ -81,6 +84,9 @@ const ALLOWED: [(Tag, &[u8; 2]); 44] = [
     (MODALITY_LUT, b"SQ"), // only to refuse it
     (PIXEL_MEASURES_SEQUENCE, b"SQ"),
     (PIXEL_VALUE_SEQUENCE, b"SQ"),
+    (SEGMENT_IDENTIFICATION, b"SQ"),
+    (REFERENCED_SEGMENT, b"US"),
+    (MAXIMUM_FRACTION, b"US"),
     (SHARED_GROUPS, b"SQ"),
     (PER_FRAME_GROUPS, b"SQ"),
     (0x7fe0_0008, b"OF"), // FloatPixelData: only to refuse it
