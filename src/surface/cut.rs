@@ -172,7 +172,7 @@ fn landed_rims(
     for (&(v, tie, plane), l) in rim.iter().zip(&landings) {
         let sine = tie.free(l.gradient).length() / l.gradient.length();
         let moved = l.at.distance(fabric.web.at[v as usize]);
-        if !(sine >= GRAZING && moved <= RIM_REACH * reach) {
+        if sine.is_nan() || sine < GRAZING || moved > RIM_REACH * reach {
             return Err(Error::GrazingCut { plane, sine, at: P3::from_raw(fabric.web.at[v as usize]) });
         }
         landed(v as usize, l)?;

@@ -101,7 +101,7 @@ fn foot(field: &dyn Field, x: DVec3, step_mm: f64) -> Foot {
     for _ in 0..ROUNDS {
         let l = land(field, at, &Tie::WALL, approach);
         evaluations += l.evaluations;
-        if !l.at.is_finite() || !(l.distance <= approach.enough_mm) {
+        if !l.at.is_finite() || l.distance.is_nan() || l.distance > approach.enough_mm {
             break;
         }
         // -grad f / |grad f| looks outward

@@ -6,6 +6,31 @@ use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
+/// What is timed.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+pub(crate) enum What {
+    /// The whole reconstruction.
+    Whole,
+    /// The remeshing of the benchmark anastomosis, beside other programs in the same run.
+    Surface,
+}
+
+/// Our remeshing and others' on one raw surface: quality, distance to the analytic vessel, time.
+pub(crate) fn surface() -> Result<()> {
+    let work = tools::target()?.join("bench-surface");
+    fs::create_dir_all(&work)?;
+    let mut ours = shell::command("cargo");
+    ours.args(["run", "--release", "-q", "-p", "surface", "--example", "survey", "--", "0", "0"]).arg(&work);
+    shell::run(ours)?;
+    let python = tools::python()?;
+    let mut pip = shell::command(&python);
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "pyacvd==0.4.0", "mmgpy==0.17.1"]);
+    shell::run(pip)?;
+    let mut peers = shell::command(&python);
+    peers.arg(shell::root()?.join("tests/bench/surface.py")).env("SURFACES", &work);
+    shell::run(peers)
+}
+
 /// Reconstruct the demo scan `repeat` times and show medians.
 pub(crate) fn run(binary: &Path, repeat: usize) -> Result<()> {
     ensure!(repeat > 0, "at least one repetition");

@@ -39,8 +39,11 @@ enum Command {
         #[arg(long, default_value_t = 1)]
         first: u64,
     },
-    /// Time and memory of the whole reconstruction, stage by stage.
+    /// Time and memory of the whole reconstruction, stage by stage; or of one part beside its peers.
     Bench {
+        /// `whole`, or `surface`: the remeshing beside pymeshlab, pyacvd and mmgpy (installed by pip).
+        #[arg(default_value = "whole")]
+        what: bench::What,
         /// Repetitions; the medians are shown.
         #[arg(long, default_value_t = 5)]
         repeat: usize,
@@ -62,7 +65,8 @@ fn run(command: Command) -> Result<()> {
         Command::Demo { seed, keep } => demo(seed, keep),
         Command::Test => check::all(),
         Command::Survey { count, first } => survey::run(&tools::release_binary()?, first, count),
-        Command::Bench { repeat } => bench::run(&tools::release_binary()?, repeat),
+        Command::Bench { what: bench::What::Whole, repeat } => bench::run(&tools::release_binary()?, repeat),
+        Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
     }
 }
 

@@ -17,6 +17,7 @@ const PYTHON_PACKAGES: &[&str] = &[
     "openapi-spec-validator==0.7.2",
     "jsonschema<5",
     "PyYAML",
+    "pymeshlab==2025.7.post1",
 ];
 const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1"];
 
