@@ -7,8 +7,8 @@
 //! corner of the volume inside a lumen). Only when all planes are done do rims move onto f = 0 within their planes.
 //!
 //! Rejected: clipping triangle by triangle with vertices snapped into the plane (wrong Euler number for one grid-aligned
-//! tube in ten), and landing rim vertices on f while cutting: neighbours nearer to each other than the wall is to the
-//! mesh changed places, and the rim crossed itself in 3 of the first 40 phantoms of the survey.
+//! tube in ten), and landing rim vertices on f while cutting, where neighbours nearer to each other than the wall is to
+//! the mesh may change places (docs/adr/0040).
 
 use crate::cap::recap;
 use crate::fabric::Fabric;
