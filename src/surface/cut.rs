@@ -7,8 +7,8 @@
 //! corner of the volume inside a lumen). Only when all planes are done do rims move onto f = 0 within their planes.
 //!
 //! Rejected: clipping triangle by triangle with vertices snapped into the plane (wrong Euler number for one grid-aligned
-//! tube in ten), and landing rim vertices on f while cutting: neighbours nearer to each other than the wall is to the
-//! mesh changed places, and the rim crossed itself in 3 of the first 40 phantoms of the survey.
+//! tube in ten), and landing rim vertices on f while cutting, where neighbours nearer to each other than the wall is to
+//! the mesh may change places (docs/adr/0040).
 
 use crate::cap::recap;
 use crate::fabric::Fabric;
@@ -172,7 +172,7 @@ fn landed_rims(
     for (&(v, tie, plane), l) in rim.iter().zip(&landings) {
         let sine = tie.free(l.gradient).length() / l.gradient.length();
         let moved = l.at.distance(fabric.web.at[v as usize]);
-        if !(sine >= GRAZING && moved <= RIM_REACH * reach) {
+        if sine.is_nan() || sine < GRAZING || moved > RIM_REACH * reach {
             return Err(Error::GrazingCut { plane, sine, at: P3::from_raw(fabric.web.at[v as usize]) });
         }
         landed(v as usize, l)?;

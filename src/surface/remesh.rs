@@ -1,8 +1,8 @@
 //! A closed mesh to one that a solver accepts: every wall vertex on f = 0, every angle wide, edges of the wanted size.
 //!
 //! Botsch and Kobbelt, "A remeshing approach to multiresolution modeling" (2004), with the surface given by f instead of
-//! by the old mesh: split and moved vertices are landed on f = 0 by one Newton step while the mesh changes and exactly at
-//! the end, sizes come from the exact curvature of f, and a last pass mends single triangles ([`crate::polish`]).
+//! by the old mesh: vertices follow f by their neighbours' normals while the mesh changes, are landed on f = 0 once
+//! in between and exactly at the end, sizes come from the exact curvature of f, and a last pass mends single triangles ([`crate::polish`]).
 //! Projection on the old mesh (what pmp-library does) was rejected: 1.4e-2 mm rms against 5.4e-3 at the same size.
 
 use crate::fabric::Fabric;
@@ -84,8 +84,8 @@ const CAP_SLACK_MM: f64 = 1e-6;
 /// `cuts` are the planes by which the caps were cut, in any order (each cap takes the one that it lies in). The result
 /// is closed and 2-manifold like the input; wall and rim vertices have |f| / |grad f| <= 1e-9 mm, caps stay planar, rims
 /// stay rims, face ids stay. Not promised: the goal angle (see the report), and |distance| <= `max_error_mm` where
-/// `edge_mm` forbids it. Cost: about 18 calls of (f, grad f) per vertex at
-/// the default number of rounds, and by curvature 5 with second derivatives.
+/// `edge_mm` forbids it. Cost: 4 to 5 calls of f per vertex of the
+/// result, by curvature about 2 of them with second derivatives (docs/adr/0041).
 ///
 /// # Errors
 /// [`Error::Defect`] for an open or broken mesh, [`Error::CapPlane`], [`Error::TooManyTriangles`],

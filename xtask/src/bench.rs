@@ -13,6 +13,8 @@ pub(crate) enum What {
     Whole,
     /// Thinning beside gaara and scikit-image on the same volumes.
     Thinning,
+    /// The remeshing of the benchmark anastomosis beside other programs on the same surface.
+    Surface,
 }
 
 /// Thin the same volumes with our code, gaara and scikit-image, interleaved, and show medians and ratios.
@@ -26,6 +28,22 @@ pub(crate) fn thinning(repeat: usize) -> Result<()> {
     bench.arg(shell::root()?.join("tests/python/bench_thinning.py"));
     bench.arg(tools::target()?.join("release/examples/thinning")).arg(&work).arg(repeat.to_string());
     shell::run(bench)
+}
+
+/// Our remeshing and others' on one raw surface: quality, distance to the analytic vessel, time.
+pub(crate) fn surface() -> Result<()> {
+    let work = tools::target()?.join("bench-surface");
+    fs::create_dir_all(&work)?;
+    let mut ours = shell::command("cargo");
+    ours.args(["run", "--release", "-q", "-p", "surface", "--example", "survey", "--", "0", "0"]).arg(&work);
+    shell::run(ours)?;
+    let python = tools::python()?;
+    let mut pip = shell::command(&python);
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "pyacvd==0.4.0", "mmgpy==0.17.1"]);
+    shell::run(pip)?;
+    let mut peers = shell::command(&python);
+    peers.arg(shell::root()?.join("tests/bench/surface.py")).env("SURFACES", &work);
+    shell::run(peers)
 }
 
 /// Reconstruct the demo scan `repeat` times and show medians.

@@ -8,6 +8,9 @@ use std::path::{Path, PathBuf};
 /// Noise seeds of the demo scan that the test command reconstructs (the survey runs ten).
 const SEEDS: u64 = 3;
 
+/// Random vessels whose surfaces another program judges (the whole survey takes 200).
+const SURFACES: &str = "20";
+
 /// Run all checks.
 pub(crate) fn all() -> Result<()> {
     tools::compiler()?;
@@ -52,6 +55,12 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     let mut run = shell::command(binary);
     run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json")).arg("--out").arg(&out);
     shell::run(run)?;
+    let surfaces = work.join("surfaces");
+    fs::create_dir_all(&surfaces)?;
+    let mut survey = shell::command("cargo");
+    survey.args(["run", "--release", "--quiet", "-p", "surface", "--example", "survey", "--", SURFACES, "0"]);
+    survey.arg(&surfaces);
+    shell::run(survey)?;
     let python = tools::python()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
@@ -60,7 +69,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
             .env("VASCULUM_ROOT", shell::root()?)
             .env("VASCULUM_BIN", binary)
             .env("VASCULUM_OUT", &out)
-            .env("VASCULUM_SCAN", &scan);
+            .env("VASCULUM_SCAN", &scan)
+            .env("SURFACES", &surfaces);
         shell::run(judge)?;
     }
     let node = tools::node_packages()?;

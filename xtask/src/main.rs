@@ -78,6 +78,7 @@ fn run(command: Command) -> Result<()> {
         Command::Bench { what: bench::What::Whole, repeat } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat } => bench::thinning(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
+        Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
     }
 }
 

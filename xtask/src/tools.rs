@@ -25,6 +25,7 @@ const PYTHON_PACKAGES: &[&str] = &[
     "openapi-spec-validator==0.7.2",
     "jsonschema<5",
     "PyYAML",
+    "pymeshlab==2025.7.post1",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];

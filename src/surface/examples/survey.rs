@@ -25,6 +25,7 @@ struct Line {
     sound: bool,
     least: f64,
     ms: [f64; 3],
+    cpu: f64,
     mesh: TriMesh,
 }
 
@@ -37,17 +38,21 @@ fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f
     let t = Instant::now();
     let closed = if p.cuts.is_empty() { raw } else { cut(&raw, &p.field, &p.cuts, ctx)?.0 };
     ms[1] = t.elapsed().as_secs_f64() * 1e3;
-    let t = Instant::now();
+    if let (true, Some(folder)) = (name.starts_with("benchmark"), std::env::args().nth(3)) {
+        std::fs::write(format!("{folder}/benchmark-raw.off"), off(&closed)).unwrap();
+    }
+    let (t, cpu) = (Instant::now(), cpu_s());
     let s = RemeshSettings { sizing, max_error_mm, ..RemeshSettings::default() };
     let (mesh, report) = remesh(&closed, &p.field, &p.cuts, &s, ctx)?;
     ms[2] = t.elapsed().as_secs_f64() * 1e3;
+    let cpu = cpu_s() - cpu;
     let topology = check(&mesh).unwrap();
     let sound =
         topology.euler == p.euler && topology.components == 1 && self_intersections(&mesh, ctx).unwrap().is_empty();
     let least = if matches!(sizing, Sizing::Curvature) { 30.0 } else { 33.0 };
     let cells_per = polygonised.cells_visited as f64 / polygonised.cells as f64;
     let quality = quality(&mesh, &p.field, ctx).unwrap();
-    Ok(Line { name: name.into(), quality, report, cells_per, sound, least, ms, mesh })
+    Ok(Line { name: name.into(), quality, report, cells_per, sound, least, ms, cpu, mesh })
 }
 
 impl Line {
@@ -85,6 +90,13 @@ impl Line {
     }
 }
 
+/// CPU time of this process so far, s (Linux; 0 elsewhere).
+fn cpu_s() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let ticks = stat.split_whitespace().skip(13).take(2).filter_map(|x| x.parse::<f64>().ok());
+    ticks.sum::<f64>() / 100.0
+}
+
 /// Geomview's OFF, for programs that judge or compete.
 fn off(mesh: &TriMesh) -> String {
     let mut text = format!("OFF\n{} {} 0\n", mesh.vertices.len(), mesh.triangles.len());
@@ -101,7 +113,7 @@ fn main() {
     let number = |k: usize, or: usize| argument(k).and_then(|a| a.parse().ok()).unwrap_or(or);
     let (count, first, folder) = (number(1, 200), number(2, 0), argument(3));
     let ctx = Ctx::new(0).unwrap();
-    let (mut lines, mut refused) = (Vec::new(), 0);
+    let (mut lines, mut refused, mut times) = (Vec::new(), 0, String::new());
     let mut keep = |line: Result<Line, Error>, name: &str, always: bool| match line {
         Ok(line) => {
             if !line.holds() || always {
@@ -109,6 +121,7 @@ fn main() {
             }
             if let Some(folder) = &folder {
                 std::fs::write(format!("{folder}/{}.off", line.name.replace(' ', "-")), off(&line.mesh)).unwrap();
+                times += &format!("{},{},{}\n", line.name, line.ms[2] * 1e-3, line.cpu);
             }
             lines.push(Line { mesh: TriMesh::default(), ..line });
         }
@@ -130,6 +143,9 @@ fn main() {
             let name = format!("{i}-{name}");
             keep(run(&name, &p, shift, sizing, 0.03, &ctx), &name, i % 20 < 4);
         }
+    }
+    if let Some(folder) = &folder {
+        std::fs::write(format!("{folder}/times.csv"), times).unwrap();
     }
     let missed = lines.iter().filter(|l| !l.holds()).count();
     let worst = |f: &dyn Fn(&Line) -> f64| lines.iter().map(f).fold(f64::NEG_INFINITY, f64::max);
