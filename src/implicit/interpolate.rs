@@ -127,3 +127,71 @@ pub fn interpolant(
     };
     Ok((Variational::new(points.to_vec(), scale, &solution)?, report))
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::Field;
+
+    /// Rings of wall and interior points of a bent tube, mm.
+    fn vessel() -> (Vec<P3>, Vec<f64>) {
+        let mut out = (Vec::new(), Vec::new());
+        for i in 0..700 {
+            let (ring, k) = (i / 28, i % 28);
+            let angle = (f64::from(k) + 0.618 * f64::from(ring)) / 28.0 * std::f64::consts::TAU;
+            let z = 1.5 * f64::from(ring);
+            for inside in [0.0, 1.0] {
+                let r = 3.0 + 0.3 * (2.0 * angle).sin() - inside;
+                out.0.push(P3::new(r * angle.cos() + 0.01 * z * z, r * angle.sin(), z));
+                out.1.push(inside);
+            }
+        }
+        out
+    }
+
+    fn values_at(points: &[P3], values: &[f64], targets: &[P3]) -> Vec<f64> {
+        let noise: Vec<f64> = values.iter().map(|v| 1e-8 + 1e-6 * v).collect();
+        let ctx = Ctx::new(2).unwrap();
+        let (f, report) = interpolant(points, (values, &noise), 1e-9, Method::BySize, &ctx).unwrap();
+        assert!(report.iterations > 0 && report.residual_max <= 1e-9);
+        targets.iter().map(|&t| f.value(t)).collect()
+    }
+
+    #[test]
+    fn f_is_the_same_after_motion_reversal_permutation_and_in_other_units() {
+        let (points, values) = vessel();
+        let targets: Vec<P3> =
+            (0..40).map(|i| P3::new(2.0, 0.1 * f64::from(i) - 2.0, 0.7 * f64::from(i) + 3.0)).collect();
+        let before = values_at(&points, &values, &targets);
+        let same = |name: &str, after: Vec<f64>| {
+            let off = before.iter().zip(&after).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+            assert!(off < 1e-8, "{name}: {off:e}");
+        };
+        let (s, c) = 0.7_f64.sin_cos();
+        let moved = |p: &P3| P3::new(c * p.x() - s * p.z() + 40.0, p.y() - 130.0, s * p.x() + c * p.z() + 900.0);
+        let all = |f: &dyn Fn(&P3) -> P3, of: &[P3]| of.iter().map(f).collect::<Vec<P3>>();
+        same("motion", values_at(&all(&moved, &points), &values, &all(&moved, &targets)));
+        let inches = |p: &P3| P3::new(p.x() / 25.4, p.y() / 25.4, p.z() / 25.4);
+        same("units", values_at(&all(&inches, &points), &values, &all(&inches, &targets)));
+        let (mut p, mut v) = (points.clone(), values.clone());
+        p.reverse();
+        v.reverse();
+        same("reversal", values_at(&p, &v, &targets));
+        let shuffled: Vec<usize> = (0..points.len()).map(|i| i * 601 % points.len()).collect();
+        let pick = |i: &usize| (points[*i], values[*i]);
+        let (p, v): (Vec<P3>, Vec<f64>) = shuffled.iter().map(pick).unzip();
+        same("permutation", values_at(&p, &v, &targets));
+    }
+
+    #[test]
+    fn a_single_slice_is_refused_by_every_method() {
+        let (points, values) = vessel();
+        let flat: Vec<P3> = points.iter().map(|p| P3::new(p.x(), p.y(), 7.5)).collect();
+        let noise = vec![1e-6; flat.len()];
+        for method in [Method::BySize, Method::Dense, Method::Iterative] {
+            let outcome = interpolant(&flat, (&values, &noise), 1e-9, method, &Ctx::new(1).unwrap());
+            assert!(matches!(outcome, Err(Error::Coplanar { points: 1400 })), "{method:?}");
+        }
+    }
+}

@@ -2,6 +2,7 @@
 //!
 //! `rbf-peer ours|peer N [threads]` prints CPU seconds of the whole process, memory and the true residual. Each row is a
 //! process of its own: `for n in 5000 10000 20000 50000; do for who in ours peer; do rbf-peer $who $n; done; done`.
+//! Built with `cargo build --release --ignore-rust-version` in this folder (the peer asks for a newer compiler than it needs).
 
 use exec::Ctx;
 use ferreus_rbf::RBFInterpolator;
