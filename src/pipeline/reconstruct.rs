@@ -62,8 +62,7 @@ fn reconstruct(
     let morphometry = steps
         .step("measure", |ctx| morphometry::measure(&graph, &sampled, &contours.cuts, &plan.morphometry(), ctx))?;
 
-    let warnings: Vec<Warning> =
-        [input.warnings.clone(), segmentation.warnings.clone(), medial.warnings].into_iter().flatten().collect();
+    let warnings: Vec<Warning> = told(&input, Some(&segmentation)).cloned().chain(medial.warnings).collect();
     let mut files = steps.step("write", |_| {
         write::write_all(&Reconstruction {
             input: facts::input(&input),
@@ -293,10 +292,7 @@ fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imag
             "lumens": facts.lumens.iter().map(|[s, n]| json!({"slice": s, "count": n})).collect::<Vec<_>>(),
         })
     });
-    let warnings: Vec<Value> = input
-        .warnings
-        .iter()
-        .chain(found.iter().flat_map(|(_, report)| &report.warnings))
+    let warnings: Vec<Value> = told(input, found.map(|(_, report)| report))
         .map(|w| json!({"code": w.code, "message": w.message, "where": artefact::problem::Where::of(&w.place)}))
         .collect();
     json!({
@@ -311,6 +307,14 @@ fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imag
         "segmentation": segmentation,
         "warnings": warnings,
     })
+}
+
+/// The reader's and the segmentation's warnings. Both tell gaps: the segmentation knows also those of slices that the plan
+/// leaves out, so that its word is the one to keep.
+fn told<'a>(input: &'a InputReport, found: Option<&'a imaging::Report>) -> impl Iterator<Item = &'a Warning> {
+    let later = found.map_or(&[][..], |r| &r.warnings);
+    let again = move |w: &&Warning| w.code == "stack.gap" && later.iter().any(|l| l.code == w.code);
+    input.warnings.iter().filter(move |w| !again(w)).chain(later)
 }
 
 /// Centres of the eight corner voxels, LPS mm: first and last slice, in each first and last row, in each first and last

@@ -40,9 +40,8 @@ pub use result::{result_json, skeleton_json};
 pub use slices::slice_pictures;
 pub use stl::surface_stl;
 
+pub use crate::NamedBytes;
 use crate::Reconstruction;
-use sha2::{Digest, Sha256};
-use std::fmt::Write as _;
 
 /// The numbers.
 pub const RESULT_JSON: &str = "result.json";
@@ -70,27 +69,6 @@ pub const PROVENANCE_JSON: &str = "provenance.json";
 /// Size of preview.png, pixels.
 pub const PREVIEW_SIZE: [usize; 2] = [480, 360];
 
-/// A file in memory.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NamedBytes {
-    /// Its name in the folder and in the API.
-    pub name: &'static str,
-    /// Its content.
-    pub bytes: Vec<u8>,
-}
-
-impl NamedBytes {
-    /// `sha256:` and the hexadecimal digest of the content.
-    pub fn digest(&self) -> String {
-        let mut out = String::from("sha256:");
-        for byte in Sha256::digest(&self.bytes) {
-            // Writing into a String cannot fail.
-            let _ = write!(out, "{byte:02x}");
-        }
-        out
-    }
-}
-
 /// Media type of an artefact by its name.
 pub fn media_type(name: &str) -> &'static str {
     match name.rsplit('.').next() {
@@ -115,7 +93,7 @@ pub fn media_type(name: &str) -> &'static str {
 /// together; [`Error::TooLarge`] beyond a format's own limit; [`Error::Encode`].
 pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
     let contours = geometry::contour_lines(r.contours)?;
-    let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes { name, bytes: bytes? });
+    let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes::new(name, bytes?));
     Ok(vec![
         make(RESULT_JSON, result_json(r))?,
         make(ANGLES_CSV, angles_csv(r))?,
