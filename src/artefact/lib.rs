@@ -1,9 +1,11 @@
 //! Bytes to types and back: the only crate that knows a file format.
 
+mod named;
 pub mod plan;
 pub mod problem;
 pub mod read;
 pub mod reconstruction;
 pub mod write;
 
+pub use named::NamedBytes;
 pub use reconstruction::Reconstruction;

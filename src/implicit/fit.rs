@@ -113,8 +113,9 @@ const FIRST_MM: f64 = 1e-6;
 /// Largest true residual of the final pass, mm: 1e-9 keeps f the same to 1e-8 under rigid motion, reversal and
 /// permutation. Rounding leaves 1e-11 of noisy contours, and up to 1e-8 of 12,000 noise-free ones.
 const FINAL_MM: f64 = 1e-9;
-/// Beyond this residual a fit is refused, mm.
-const ACCEPTED_MM: f64 = 1e-6;
+/// Beyond this residual a fit is refused, mm: a hundredth of what the best contours err. A real aorta with 36,297
+/// constraints, whose errors differ by a factor of a thousand, stayed at 2e-5.
+const ACCEPTED_MM: f64 = 1e-4;
 
 fn solve(
     c: &Constraints,

@@ -39,7 +39,7 @@ fn write_and_swap(out: &Path, partial: &Path, files: &[NamedBytes]) -> std::io::
     }
     fs::create_dir_all(partial)?;
     for file in files {
-        fs::write(partial.join(file.name), &file.bytes)?;
+        fs::write(partial.join(&file.name), &file.bytes)?;
     }
     if !out.exists() {
         return fs::rename(partial, out);
@@ -72,7 +72,7 @@ mod tests {
         fs::write(out.join("thesis.doc"), "mine").unwrap();
         assert_eq!(refuse_foreign(&out).unwrap_err().code, "output.taken");
         fs::remove_file(out.join("thesis.doc")).unwrap();
-        let files = |text: &str| vec![NamedBytes { name: "provenance.json", bytes: text.into() }];
+        let files = |text: &str| vec![NamedBytes::new("provenance.json", text)];
         publish(&out, &files("one")).unwrap();
         refuse_foreign(&out).unwrap();
         publish(&out, &files("two")).unwrap();

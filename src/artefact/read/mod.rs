@@ -26,27 +26,12 @@ mod report;
 mod samples;
 mod volume;
 
+pub use crate::NamedBytes;
 pub use collect::collect;
 pub use error::Error;
 pub use intake::intake;
 pub use limits::Limits;
 pub use report::{Acquisition, Format, InputReport, stack, stack_of};
-
-/// A file's bytes with its name inside the upload.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NamedBytes {
-    /// Name with `/` between folders; never a path of this machine.
-    pub name: String,
-    /// Content.
-    pub bytes: Vec<u8>,
-}
-
-impl NamedBytes {
-    /// A named file.
-    pub fn new(name: impl Into<String>, bytes: impl Into<Vec<u8>>) -> Self {
-        Self { name: name.into(), bytes: bytes.into() }
-    }
-}
 
 #[cfg(test)]
 mod tests;

@@ -102,7 +102,7 @@ pub fn mesh_vtp(name: &'static str, mesh: &TriMesh) -> Result<NamedBytes, Error>
         cell_arrays: vec![Array::id("FaceId", mesh.face_id.iter().map(|&f| f as usize))],
         ..PolyData::default()
     };
-    Ok(NamedBytes { name, bytes: data.write(name)? })
+    Ok(NamedBytes { name: name.into(), bytes: data.write(name)? })
 }
 
 /// Abscissas of the points of a polyline, mm.

@@ -42,9 +42,8 @@ pub use slices::slice_pictures;
 pub use stl::surface_stl;
 pub use trees::{skeleton_graphml, skeleton_swc};
 
+pub use crate::NamedBytes;
 use crate::Reconstruction;
-use sha2::{Digest, Sha256};
-use std::fmt::Write as _;
 
 /// The numbers.
 pub const RESULT_JSON: &str = "result.json";
@@ -80,27 +79,6 @@ pub const PROVENANCE_JSON: &str = "provenance.json";
 /// Size of preview.png, pixels.
 pub const PREVIEW_SIZE: [usize; 2] = [480, 360];
 
-/// A file in memory.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NamedBytes {
-    /// Its name in the folder and in the API.
-    pub name: &'static str,
-    /// Its content.
-    pub bytes: Vec<u8>,
-}
-
-impl NamedBytes {
-    /// `sha256:` and the hexadecimal digest of the content.
-    pub fn digest(&self) -> String {
-        let mut out = String::from("sha256:");
-        for byte in Sha256::digest(&self.bytes) {
-            // Writing into a String cannot fail.
-            let _ = write!(out, "{byte:02x}");
-        }
-        out
-    }
-}
-
 /// Media type of an artefact by its name.
 pub fn media_type(name: &str) -> &'static str {
     match name.rsplit('.').next() {
@@ -126,10 +104,10 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
     let asked = |name: &str| outputs.iter().any(|o| o == name);
     let mut files = Vec::new();
     if asked("graphml") {
-        files.push(NamedBytes { name: SKELETON_GRAPHML, bytes: skeleton_graphml(r)? });
+        files.push(NamedBytes { name: SKELETON_GRAPHML.into(), bytes: skeleton_graphml(r)? });
     }
     if asked("swc") {
-        files.push(NamedBytes { name: SKELETON_SWC, bytes: skeleton_swc(r)? });
+        files.push(NamedBytes { name: SKELETON_SWC.into(), bytes: skeleton_swc(r)? });
     }
     Ok(files)
 }
@@ -142,7 +120,7 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
 /// together; [`Error::TooLarge`] beyond a format's own limit; [`Error::Encode`].
 pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
     let contours = geometry::contour_lines(r.contours)?;
-    let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes { name, bytes: bytes? });
+    let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes::new(name, bytes?));
     Ok(vec![
         make(RESULT_JSON, result_json(r))?,
         make(ANGLES_CSV, angles_csv(r))?,

@@ -95,8 +95,8 @@ pub fn provenance(p: &Provenance, artefacts: &[NamedBytes]) -> Result<NamedBytes
         artefacts: artefacts
             .iter()
             .map(|a| Artefact {
-                name: a.name,
-                media_type: super::media_type(a.name),
+                name: &a.name,
+                media_type: super::media_type(&a.name),
                 bytes: a.bytes.len(),
                 digest: a.digest(),
             })
@@ -105,5 +105,5 @@ pub fn provenance(p: &Provenance, artefacts: &[NamedBytes]) -> Result<NamedBytes
     let mut bytes = serde_json::to_vec_pretty(&document)
         .map_err(|e| Error::Encode { artefact: PROVENANCE_JSON, reason: e.to_string() })?;
     bytes.push(b'\n');
-    Ok(NamedBytes { name: PROVENANCE_JSON, bytes })
+    Ok(NamedBytes::new(PROVENANCE_JSON, bytes))
 }

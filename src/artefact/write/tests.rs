@@ -160,7 +160,7 @@ fn arrays_that_do_not_fit_together_are_refused() {
 fn all_artefacts_come_in_a_fixed_order_and_with_the_same_bytes() {
     let f = Fixture::new();
     let all = write_all(&f.reconstruction()).unwrap();
-    let names: Vec<&str> = all.iter().map(|a| a.name).collect();
+    let names: Vec<&str> = all.iter().map(|a| a.name.as_str()).collect();
     assert_eq!(
         names,
         [
@@ -351,7 +351,7 @@ fn a_vessel_tree_with_many_junctions_and_warnings_keeps_the_rest_countable() {
     let text = String::from_utf8(report_html(&r).unwrap()).unwrap();
     assert!(text.contains("and 4 more in result.json"), "8 + 1 warnings, 5 shown");
     assert!(text.contains("5 more in angles.csv"), "20 junctions, 1 + 14 shown");
-    leave("many", &[NamedBytes { name: REPORT_HTML, bytes: text.into_bytes() }]);
+    leave("many", &[NamedBytes::new(REPORT_HTML, text.into_bytes())]);
 }
 
 /// For validators of other people (tests/js, tests/python): leaves the files where it is told to.
@@ -360,7 +360,7 @@ fn leave(folder: &str, all: &[NamedBytes]) {
     let folder = std::path::Path::new(&root).join(folder);
     std::fs::create_dir_all(&folder).unwrap();
     for a in all {
-        std::fs::write(folder.join(a.name), &a.bytes).unwrap();
+        std::fs::write(folder.join(&a.name), &a.bytes).unwrap();
     }
 }
 
@@ -391,7 +391,7 @@ fn provenance_lists_every_artefact_with_its_digest() {
     assert_eq!(v["artefacts"].as_array().unwrap().len(), all.len());
     assert_eq!(v["artefacts"][0]["digest"], all[0].digest());
     assert_eq!(v["artefacts"][5]["media_type"], "model/gltf-binary");
-    let empty = NamedBytes { name: RESULT_JSON, bytes: vec![] };
+    let empty = NamedBytes::new(RESULT_JSON, vec![]);
     assert_eq!(empty.digest(), "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855");
     let broken = Provenance { stages: vec![stage("fit", f64::NAN)], ..p };
     assert!(matches!(provenance(&broken, &all), Err(Error::NotFinite { .. })));

@@ -66,6 +66,21 @@ fn an_end_at_an_oblique_cap_reaches_its_centroid_on_the_axis() {
     }
 }
 
+#[test]
+fn the_junction_of_a_trunk_that_divides_lies_where_the_largest_sphere_touches_the_divider() {
+    let (half, thin) = (17.0_f64.to_radians(), 4.0);
+    let centre = P3::new(0.3, 0.2, -0.4);
+    let arm = |side: f64| V3::new(side * half.sin(), half.cos(), 0.0);
+    let star = star(centre, &[(V3::Y * -1.0, 30.0, 6.0), (arm(1.0), 60.0, thin), (arm(-1.0), 60.0, thin)]);
+    let (graph, _) = of(&star, &at_spacing(0.6));
+    assert_eq!(counts(&graph), (3, 1, 0, 1));
+    let node = graph.nodes.iter().find(|n| n.kind == NodeKind::Junction).unwrap();
+    let divider = centre + V3::Y * (thin / half.sin());
+    assert!(off_axis(node.position, centre, V3::Y) < 0.1, "{:?}", node.position);
+    let gap = divider.distance(node.position);
+    assert!((gap - node.radius_mm).abs() < 0.3 && gap < 4.0, "{gap} mm, radius {}", node.radius_mm);
+}
+
 fn y_shape(shift: f64) -> Star {
     let centre = P3::new(1.0 + shift, -2.0 + 0.7 * shift, 0.4 * shift);
     let branches = [
