@@ -12,6 +12,7 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    service::tls::provide();
     let arguments = Arguments::parse();
     match arguments.command {
         Command::Run(a) => jobs::run(&a),

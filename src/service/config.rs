@@ -32,14 +32,21 @@ pub struct Config {
     /// Address to listen on; port 0 takes a free one, printed and written to `<data_dir>/listen`.
     /// Default 127.0.0.1:8080.
     pub listen: SocketAddr,
-    /// `sqlite:PATH`; default `<data_dir>/vasculum.sqlite`. Other databases are refused at start.
+    /// `sqlite:PATH` or `postgres://USER:PASSWORD@HOST/DATABASE`; default `sqlite:<data_dir>/vasculum.sqlite`.
     pub database_url: Option<String>,
-    /// `file:PATH` of the artefact folder; default `<data_dir>/store`. Other stores are refused at start.
+    /// Connections to PostgreSQL that this process may hold (plus one for beats and one for hints). Default 8.
+    pub database_connections: u32,
+    /// `file:PATH` or `s3://BUCKET[/PREFIX]` (keys and endpoint in [`Config::s3`]); default `<data_dir>/store`.
     pub store_url: Option<String>,
+    /// Settings of an S3 store by their names in AWS's tools without `AWS_`, such as `endpoint` or `region`.
+    pub s3: Vec<(String, String)>,
     /// Jobs that run at the same time, each in its own process. 0: this process only serves. Default 1.
     pub workers: usize,
     /// `--threads` of each job's process; 0 lets the process take all cores. Default 0.
     pub threads: usize,
+    /// Memory that all jobs of this process may take together, MiB; 0: three quarters of what the machine has free at
+    /// start. A job's process is bound to its share. Default 0.
+    pub memory_mb: u64,
     /// Who may call. Default [`Auth::Required`].
     pub auth: Auth,
     /// The program whose `exec-job` sub-command runs one job. Default: this program.
@@ -65,7 +72,10 @@ impl Default for Config {
             data_dir: PathBuf::from("vasculum-data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             database_url: None,
+            database_connections: 8,
             store_url: None,
+            s3: Vec::new(),
+            memory_mb: 0,
             workers: 1,
             threads: 0,
             auth: Auth::Required,
@@ -89,7 +99,7 @@ impl Config {
         match &self.database_url {
             None => Ok(self.data_dir.join("vasculum.sqlite")),
             Some(url) => path_of(url, "sqlite:").ok_or_else(|| {
-                anyhow::anyhow!("this version keeps its jobs in SQLite: --database-url must be sqlite:PATH, not {url}")
+                anyhow::anyhow!("--database-url must be sqlite:PATH or postgres://USER:PASSWORD@HOST/DATABASE")
             }),
         }
     }
@@ -102,7 +112,7 @@ impl Config {
         match &self.store_url {
             None => Ok(self.data_dir.join("store")),
             Some(url) => path_of(url, "file:").ok_or_else(|| {
-                anyhow::anyhow!("this version keeps artefacts in a folder: --store-url must be file:PATH, not {url}")
+                anyhow::anyhow!("--store-url must be file:PATH or s3://BUCKET/PREFIX, not {url}")
             }),
         }
     }

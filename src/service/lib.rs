@@ -18,6 +18,7 @@ mod server;
 pub mod state;
 pub mod store;
 pub mod telemetry;
+pub mod tls;
 pub mod worker;
 
 pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes};

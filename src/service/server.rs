@@ -45,6 +45,7 @@ impl Server {
         if config.auth == Auth::None && !config.listen.ip().is_loopback() {
             bail!("refusing to serve {} without keys: leave out --no-auth, or listen on 127.0.0.1", config.listen);
         }
+        crate::tls::provide();
         let config = Arc::new(config);
         std::fs::create_dir_all(&config.data_dir)
             .with_context(|| format!("cannot make the data folder {}", config.data_dir.display()))?;
@@ -114,7 +115,7 @@ struct Parts {
 
 impl Parts {
     async fn open(config: &Config) -> anyhow::Result<Self> {
-        let queue = Queue::new(Db::open(&config.database_file()?).await?);
+        let queue = Queue::new(Db::open(config).await?);
         let store = Store::local(&config.store_dir()?)?;
         Ok(Self { queue, store })
     }
@@ -140,7 +141,7 @@ impl Parts {
             config: Arc::clone(config),
             queue: self.queue.clone(),
             store: self.store.clone(),
-            heartbeat: Heartbeat::start(&self.queue, config.database_file()?, Arc::clone(&owner))?,
+            heartbeat: Heartbeat::start(&self.queue, Arc::clone(&owner))?,
             owner,
             shutdown: shutdown.clone(),
         });
@@ -262,7 +263,7 @@ async fn stop_signal() -> std::io::Result<()> {
 /// The database cannot be opened, or holds a newer schema.
 pub async fn migrate(config: Config) -> anyhow::Result<()> {
     std::fs::create_dir_all(&config.data_dir)?;
-    Db::open(&config.database_file()?).await?.close().await;
+    Db::open(&config).await?.close().await;
     Ok(())
 }
 
@@ -272,7 +273,7 @@ pub async fn migrate(config: Config) -> anyhow::Result<()> {
 /// The database's; no random bytes.
 pub async fn create_key(config: Config, label: &str) -> anyhow::Result<String> {
     std::fs::create_dir_all(&config.data_dir)?;
-    let db = Db::open(&config.database_file()?).await?;
+    let db = Db::open(&config).await?;
     let key = auth::create_key(&db, label).await?;
     db.close().await;
     Ok(key)

@@ -5,7 +5,7 @@
 //! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
 
 use crate::config::Auth;
-use crate::db::{Db, now};
+use crate::db::{Db, Scope, args};
 use crate::error::Problem;
 use crate::state::State;
 use crate::store::hex;
@@ -23,8 +23,7 @@ pub const COOKIE: &str = "vasculum_key";
 pub const DEFAULT_TENANT: &str = "default";
 
 /// What a key may do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, sqlx::Type)]
-#[sqlx(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Send scans and read one's results.
     Upload,
@@ -46,6 +45,21 @@ pub enum Action {
 }
 
 impl Role {
+    /// The role of a word.
+    pub fn of(word: &str) -> Option<Self> {
+        [Self::Upload, Self::Read, Self::Admin, Self::Auditor].into_iter().find(|role| role.as_str() == word)
+    }
+
+    /// The word in the table and on the command line.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Upload => "upload",
+            Self::Read => "read",
+            Self::Admin => "admin",
+            Self::Auditor => "auditor",
+        }
+    }
+
     /// Whether this role may do that.
     pub fn may(self, action: Action) -> bool {
         match action {
@@ -80,17 +94,10 @@ pub fn new_key() -> Result<String, getrandom::Error> {
 /// The database's; no random bytes.
 pub async fn first_key(db: &Db) -> anyhow::Result<Option<String>> {
     let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
-    let made = sqlx::query(concat!(
-        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) SELECT $1, $2, 'admin', 'first start', $3, ",
-        now!(),
-        " WHERE NOT EXISTS (SELECT 1 FROM api_key WHERE revoked_at IS NULL)"
-    ))
-    .bind(Uuid::now_v7().to_string())
-    .bind(DEFAULT_TENANT)
-    .bind(digest(&key))
-    .execute(&db.writer)
-    .await?
-    .rows_affected();
+    let sql = "INSERT INTO api_key (id, tenant, role, label, digest, created_at) \
+               SELECT $1, $2, 'admin', 'first start', $3, now_ms() \
+               WHERE NOT EXISTS (SELECT 1 FROM api_key WHERE revoked_at IS NULL)";
+    let made = db.run(Scope::System, sql, args![Uuid::now_v7(), DEFAULT_TENANT, digest(&key)]).await?;
     Ok((made > 0).then_some(key))
 }
 
@@ -100,17 +107,8 @@ pub async fn first_key(db: &Db) -> anyhow::Result<Option<String>> {
 /// The database's; no random bytes.
 pub async fn create_key(db: &Db, label: &str) -> anyhow::Result<String> {
     let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
-    sqlx::query(concat!(
-        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) VALUES ($1, $2, 'admin', $3, $4, ",
-        now!(),
-        ")"
-    ))
-    .bind(Uuid::now_v7().to_string())
-    .bind(DEFAULT_TENANT)
-    .bind(label)
-    .bind(digest(&key))
-    .execute(&db.writer)
-    .await?;
+    let sql = "INSERT INTO api_key (id, tenant, role, label, digest, created_at) VALUES ($1, $2, 'admin', $3, $4, now_ms())";
+    db.run(Scope::System, sql, args![Uuid::now_v7(), DEFAULT_TENANT, label, digest(&key)]).await?;
     Ok(key)
 }
 
@@ -123,15 +121,13 @@ fn digest(key: &str) -> Vec<u8> {
 /// # Errors
 /// `auth.key` when the key is unknown or revoked; the database's.
 pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
-    let row: Option<(String, Role)> =
-        sqlx::query_as("SELECT tenant, role FROM api_key WHERE digest = $1 AND revoked_at IS NULL")
-            .bind(digest(key))
-            .fetch_optional(&db.reader)
-            .await?;
-    match row {
-        Some((tenant, role)) => Ok(Principal { tenant, role }),
-        None => Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one.")),
-    }
+    let sql = "SELECT tenant, role FROM api_key WHERE digest = $1 AND revoked_at IS NULL";
+    let row = db.row(Scope::System, sql, args![digest(key)]).await?;
+    let Some(row) = row else {
+        return Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one."));
+    };
+    let role = Role::of(row.get("role")?).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
+    Ok(Principal { tenant: row.get("tenant")?, role })
 }
 
 fn unauthorized(code: &str, detail: &str) -> Problem {

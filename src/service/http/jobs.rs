@@ -103,6 +103,8 @@ async fn create(
     let job = NewJob {
         id,
         tenant: who.tenant.clone(),
+        priority: 0,
+        memory_mb: 0,
         plan: upload.plan,
         input_digest: input.digest.clone(),
         input_files: i64::try_from(input.files.len()).map_err(Problem::internal)?,

@@ -56,7 +56,7 @@ async fn digests(client: &reqwest::Client, base: &str, id: &str) -> Value {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_server_finishes_its_job_after_restart() {
     let folder = tempfile::TempDir::new().unwrap();
-    let client = reqwest::Client::new();
+    let client = support::client();
     let (mut server, base) = start(folder.path());
     let send = |base: String| {
         let request = support::upload(&client, &base, &json!({"seconds": 1.5}));

@@ -18,7 +18,7 @@ pub use owner::Owner;
 use crate::config::Config;
 use crate::error::Problem;
 use crate::media::media_type;
-use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict};
+use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Room, Verdict};
 use crate::store::Store;
 use child::{Child, Ended};
 use folder::Folder;
@@ -54,7 +54,7 @@ impl Worker {
     pub async fn slot(self: Arc<Self>) {
         let mut changes = self.queue.changes();
         while !self.shutdown.is_cancelled() {
-            match self.queue.claim(self.owner.name()).await {
+            match self.queue.claim(self.owner.name(), Room::Any).await {
                 Ok(Some(claim)) => self.job(&claim).await,
                 Ok(None) => tokio::select! {
                     () = self.shutdown.cancelled() => {}

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, dead_code, unreachable_pub, missing_docs)]
 
+pub mod postgres;
+
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode, multipart};
 use serde_json::Value;
 use service::{Auth, Config, Server};
@@ -83,7 +85,7 @@ impl Service {
         let mut config = config(folder.path());
         change(&mut config);
         let server = Server::start(config).await.unwrap();
-        Self { base: format!("http://{}", server.address()), server: Some(server), client: Client::new(), folder }
+        Self { base: format!("http://{}", server.address()), server: Some(server), client: client(), folder }
     }
 
     pub fn data(&self) -> PathBuf {
@@ -129,6 +131,12 @@ impl Service {
         self.server.take().unwrap().stop().await;
         self.folder
     }
+}
+
+/// A client; its TLS provider must be there first.
+pub fn client() -> Client {
+    service::tls::provide();
+    Client::new()
 }
 
 pub fn upload(client: &Client, base: &str, plan: &Value) -> RequestBuilder {
