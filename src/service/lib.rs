@@ -12,6 +12,7 @@ pub mod db;
 pub mod error;
 mod http;
 pub mod intake;
+mod keeping;
 pub mod media;
 pub mod queue;
 mod server;

@@ -3,6 +3,7 @@
 mod bench;
 mod check;
 mod shell;
+mod storm;
 mod survey;
 mod tools;
 
@@ -39,6 +40,24 @@ enum Command {
         #[arg(long, default_value_t = 1)]
         first: u64,
     },
+    /// Kill server, workers, children and the database at random while jobs come in; then look at every promise.
+    Storm {
+        /// Kills on each database.
+        #[arg(long, default_value_t = 1000)]
+        kills: usize,
+        /// Jobs on each database.
+        #[arg(long, default_value_t = 20_000)]
+        jobs: usize,
+        /// Seed of the order of kills.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+    },
+    /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued.
+    BenchQueue {
+        /// Jobs queued in the large case.
+        #[arg(long, default_value_t = 1_000_000)]
+        large: u64,
+    },
     /// Time and memory of the whole reconstruction, stage by stage.
     Bench {
         /// Repetitions; the medians are shown.
@@ -62,6 +81,8 @@ fn run(command: Command) -> Result<()> {
         Command::Demo { seed, keep } => demo(seed, keep),
         Command::Test => check::all(),
         Command::Survey { count, first } => survey::run(&tools::release_binary()?, first, count),
+        Command::Storm { kills, jobs, seed } => storm::run(kills, jobs, seed),
+        Command::BenchQueue { large } => storm::bench(large),
         Command::Bench { repeat } => bench::run(&tools::release_binary()?, repeat),
     }
 }

@@ -67,6 +67,15 @@ pub(crate) fn node() -> Result<()> {
     Ok(())
 }
 
+/// A database server for the queue's tests; they run it themselves, in a temporary folder, as a user that is not root.
+pub(crate) fn postgres() -> Result<()> {
+    let servers = fs::read_dir("/usr/lib/postgresql").into_iter().flatten().flatten();
+    if servers.into_iter().any(|version| version.path().join("bin/initdb").exists()) {
+        return Ok(());
+    }
+    apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
+}
+
 /// Headless browser for the portal's test.
 pub(crate) fn browser() -> Result<()> {
     if shell::has("chromium") {

@@ -104,7 +104,7 @@ async fn create(
         id,
         tenant: who.tenant.clone(),
         priority: 0,
-        memory_mb: 0,
+        memory_mb: crate::worker::expected_mb(bytes),
         plan: upload.plan,
         input_digest: input.digest.clone(),
         input_files: i64::try_from(input.files.len()).map_err(Problem::internal)?,

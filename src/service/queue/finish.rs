@@ -26,6 +26,8 @@ pub enum Closing {
     Failed(Problem),
     /// The child died without a word: tried again while attempts are left, then failed.
     Crashed(String),
+    /// The child met its bound of memory, MiB: tried again while attempts are left, then failed.
+    OutOfMemory(i64),
     /// Ended by its owner.
     Cancelled,
     /// The server stops: back into the queue without counting this start.
@@ -40,6 +42,15 @@ pub(super) fn crashed(how: &str) -> Problem {
         format!(
             "The job's process died at every attempt ({how}). Retry it, or send a smaller volume if memory is short."
         ),
+    )
+}
+
+/// The problem of a job that met its bound of memory at its last attempt.
+fn out_of_memory(bound_mb: i64) -> Problem {
+    Problem::new(
+        StatusCode::UNPROCESSABLE_ENTITY,
+        "job.memory",
+        format!("The job needed more than the {bound_mb} MiB that it may take. Send a smaller volume, or ask the operator for a worker with more memory."),
     )
 }
 
@@ -69,7 +80,7 @@ async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Resu
         stage = CASE WHEN $3 = 'failed' THEN stage END, result = $5, attempt = attempt - $6, run_at = now_ms() + $7, \
         finished_at = CASE WHEN $3 = 'queued' THEN NULL ELSE now_ms() END, revision = revision + 1 \
         WHERE id = $1 AND fence = $2 AND state = 'running'";
-    let pause = if matches!(closing, Closing::Crashed(_)) { BACKOFF_MS * claim.attempt * claim.attempt } else { 0 };
+    let pause = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) { BACKOFF_MS * claim.attempt * claim.attempt } else { 0 };
     let values = args![
         &claim.id,
         claim.fence,
@@ -114,7 +125,10 @@ fn outcome(claim: &Claim, closing: &Closing, cancel: bool) -> (JobState, Option<
         Closing::Succeeded(_) => (JobState::Succeeded, None),
         Closing::Failed(problem) => (JobState::Failed, Some(problem.clone())),
         Closing::Crashed(how) if claim.attempt >= claim.max_attempts => (JobState::Failed, Some(crashed(how))),
-        Closing::Crashed(_) | Closing::HandedBack => (JobState::Queued, None),
+        Closing::OutOfMemory(bound) if claim.attempt >= claim.max_attempts => {
+            (JobState::Failed, Some(out_of_memory(*bound)))
+        }
+        Closing::Crashed(_) | Closing::OutOfMemory(_) | Closing::HandedBack => (JobState::Queued, None),
         Closing::Cancelled => (JobState::Cancelled, None),
     }
 }

@@ -1,4 +1,4 @@
-//! The artefact store: object keys and bytes, on a local folder with fsync.
+//! The artefact store: object keys and bytes, on a local folder with fsync or in any S3.
 //!
 //! Keys: `jobs/<id>/input/NNNNNN` with a manifest beside them, and `jobs/<id>/artefacts/<fence>/<name>`. The fence in
 //! the key keeps a worker that lost its lease from overwriting the files of the one that holds it. An object exists
@@ -10,9 +10,20 @@ use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
+use crate::config::{Config, StorePlace};
+use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
+use object_store::prefix::PrefixStore;
+use object_store::{ClientOptions, RetryConfig};
 use std::path::Path;
+use std::str::FromStr as _;
 use std::sync::Arc;
+use std::time::Duration;
 use uuid::Uuid;
+
+/// How long one request to S3 is tried again (S3 answers 500 and 503 under load); beyond it the caller hears 503.
+const S3_PATIENCE: Duration = Duration::from_secs(20);
+/// A request to S3 that takes longer is tried again.
+const S3_REQUEST: Duration = Duration::from_secs(60);
 
 /// What the store can answer.
 #[derive(Debug, thiserror::Error)]
@@ -93,6 +104,42 @@ fn input_key(job: Uuid, name: &str) -> Key {
 }
 
 impl Store {
+    /// The configured store.
+    ///
+    /// # Errors
+    /// The folder cannot be made; an address or a setting that is not understood.
+    pub fn open(config: &Config) -> anyhow::Result<Self> {
+        match config.store_place()? {
+            StorePlace::Folder(folder) => Ok(Self::local(&folder)?),
+            StorePlace::S3 { bucket, prefix } => Self::s3(&bucket, &prefix, &config.s3),
+        }
+    }
+
+    /// A store in a bucket. S3 answers a put after the object is durable.
+    fn s3(bucket: &str, prefix: &str, settings: &[(String, String)]) -> anyhow::Result<Self> {
+        crate::tls::provide();
+        let retry = RetryConfig { retry_timeout: S3_PATIENCE, ..RetryConfig::default() };
+        let mut builder = AmazonS3Builder::new()
+            .with_client_options(ClientOptions::new().with_timeout(S3_REQUEST))
+            .with_bucket_name(bucket)
+            .with_retry(retry)
+            .with_checksum_algorithm(object_store::aws::Checksum::SHA256);
+        for (name, value) in settings {
+            let name = format!("aws_{}", name.to_ascii_lowercase());
+            let key = AmazonS3ConfigKey::from_str(&name)
+                .map_err(|_| anyhow::anyhow!("there is no setting {name} of an S3 store"))?;
+            builder = builder.with_config(key, value);
+            if name == "aws_endpoint" && value.starts_with("http://") {
+                builder = builder.with_allow_http(true);
+            }
+        }
+        let objects: Arc<dyn ObjectStore> = match prefix {
+            "" => Arc::new(builder.build()?),
+            prefix => Arc::new(PrefixStore::new(builder.build()?, prefix)),
+        };
+        Ok(Self { objects })
+    }
+
     /// A store in a folder of this machine, made if missing; every put is synced to disk before it returns.
     ///
     /// # Errors
@@ -181,6 +228,25 @@ impl Store {
         Ok(self.objects.get_opts(&Key::from(key), options).await?.into_stream())
     }
 
+    /// Streams a whole object of `bytes` bytes and checks its digest on the way: the last part is held back until the
+    /// digest is known to be right, so that a reader of a damaged object sees the transfer break off, never a whole file.
+    ///
+    /// # Errors
+    /// The store's.
+    pub async fn whole(
+        &self,
+        key: &str,
+        digest: &str,
+    ) -> Result<futures::stream::BoxStream<'static, Result<bytes::Bytes, Error>>, Error> {
+        let parts = self.objects.get(&Key::from(key)).await?.into_stream();
+        let check = Check { parts, hasher: Sha256::new(), held: None, key: key.to_owned(), wanted: digest.to_owned() };
+        Ok(futures::stream::try_unfold(Some(check), |check| async move {
+            let Some(check) = check else { return Ok(None) };
+            check.next().await
+        })
+        .boxed())
+    }
+
     /// A whole object.
     ///
     /// # Errors
@@ -246,6 +312,33 @@ impl Store {
         self.objects.put(&key, "vasculum".into()).await?;
         self.objects.delete(&key).await?;
         Ok(())
+    }
+}
+
+/// A stream that is hashed while it passes.
+struct Check {
+    parts: futures::stream::BoxStream<'static, object_store::Result<bytes::Bytes>>,
+    hasher: Sha256,
+    held: Option<bytes::Bytes>,
+    key: String,
+    wanted: String,
+}
+
+impl Check {
+    /// The next part and the rest of the stream.
+    async fn next(mut self) -> Result<Option<(bytes::Bytes, Option<Self>)>, Error> {
+        while let Some(part) = self.parts.next().await {
+            let part = part?;
+            self.hasher.update(&part);
+            if let Some(ready) = self.held.replace(part) {
+                return Ok(Some((ready, Some(self))));
+            }
+        }
+        let found = format!("sha256:{}", hex(&self.hasher.finalize()));
+        if found != self.wanted {
+            return Err(Error::Digest { key: self.key, found, wanted: self.wanted });
+        }
+        Ok(self.held.map(|last| (last, None)))
     }
 }
 
