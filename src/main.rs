@@ -23,6 +23,7 @@ fn main() -> ExitCode {
         Command::Work(a) => serving::work(a),
         Command::Migrate(a) => serving::migrate(a),
         Command::Key(a) => serving::key(a),
+        Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),
         Command::Openapi => serving::openapi(),
         Command::Version => {

@@ -122,9 +122,9 @@ impl Config {
             return Ok(StorePlace::S3 { bucket: bucket.to_owned(), prefix: prefix.trim_matches('/').to_owned() });
         }
         let folder = path_of(url, "file:");
-        folder.map(StorePlace::Folder).ok_or_else(|| {
-            anyhow::anyhow!("--store-url must be file:PATH or s3://BUCKET/PREFIX, not {url}")
-        })
+        folder
+            .map(StorePlace::Folder)
+            .ok_or_else(|| anyhow::anyhow!("--store-url must be file:PATH or s3://BUCKET/PREFIX, not {url}"))
     }
 
     /// Whether other machines may use the same database.

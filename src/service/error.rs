@@ -158,7 +158,11 @@ impl From<sqlx::Error> for Problem {
         }
         let away = matches!(
             error,
-            sqlx::Error::PoolTimedOut | sqlx::Error::PoolClosed | sqlx::Error::WorkerCrashed | sqlx::Error::Io(_) | sqlx::Error::Tls(_)
+            sqlx::Error::PoolTimedOut
+                | sqlx::Error::PoolClosed
+                | sqlx::Error::WorkerCrashed
+                | sqlx::Error::Io(_)
+                | sqlx::Error::Tls(_)
         );
         let code = error.as_database_error().and_then(|e| e.code().map(|c| c.into_owned()));
         // Classes 08 and 57 of PostgreSQL: the connection broke, or the server is shutting down or starting.
@@ -176,7 +180,8 @@ impl From<sqlx::Error> for Problem {
 }
 
 /// What SQLite, PostgreSQL and the operating system say when a disk is full.
-const FULL: &[&str] = &["database or disk is full", "No space left on device", "disk quota exceeded", "Disk quota exceeded"];
+const FULL: &[&str] =
+    &["database or disk is full", "No space left on device", "disk quota exceeded", "Disk quota exceeded"];
 
 impl From<crate::store::Error> for Problem {
     fn from(error: crate::store::Error) -> Self {

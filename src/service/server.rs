@@ -245,14 +245,11 @@ pub async fn migrate(config: Config) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Make an admin key; it is stored as a digest and cannot be shown again.
+/// The database of a configuration, for the operator's own commands (keys, audit, backup).
 ///
 /// # Errors
-/// The database's; no random bytes.
-pub async fn create_key(config: Config, label: &str) -> anyhow::Result<String> {
+/// It cannot be opened, or holds a newer schema.
+pub async fn open_database(config: &Config) -> anyhow::Result<Db> {
     std::fs::create_dir_all(&config.data_dir)?;
-    let db = Db::open(&config).await?;
-    let key = auth::create_key(&db, label).await?;
-    db.close().await;
-    Ok(key)
+    Db::open(config).await
 }

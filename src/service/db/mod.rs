@@ -12,8 +12,8 @@ mod postgres;
 mod sqlite;
 mod value;
 
-pub use value::{Row, Tx, Value};
 pub(crate) use value::args;
+pub use value::{Row, Tx, Value};
 
 use crate::config::Config;
 use async_trait::async_trait;
@@ -110,7 +110,10 @@ impl Db {
             Box::pin(async move { work.await.map(|value| Box::new(value) as Output) })
         });
         let output = self.0.write(scope, boxed).await?;
-        output.downcast::<T>().map(|value| *value).map_err(|_| sqlx::Error::Protocol("a write's output was lost".into()))
+        output
+            .downcast::<T>()
+            .map(|value| *value)
+            .map_err(|_| sqlx::Error::Protocol("a write's output was lost".into()))
     }
 
     /// One statement in a transaction of its own; the number of rows it touched.

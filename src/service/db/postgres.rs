@@ -38,7 +38,8 @@ impl Postgres {
         let options = PgConnectOptions::from_str(url).context("the database address cannot be read")?;
         let options = options.application_name("vasculum");
         let place = format!("{} at {}", options.get_database().unwrap_or("postgres"), options.get_host());
-        let pool = pool(&options, connections).await.with_context(|| format!("cannot connect to the database {place}"))?;
+        let pool =
+            pool(&options, connections).await.with_context(|| format!("cannot connect to the database {place}"))?;
         let newest = MIGRATIONS.iter().map(|m| m.version).max().unwrap_or(0);
         MIGRATIONS.run(&pool).await.map_err(|error| migration_fault(error, newest, &place))?;
         Ok(Self { options, pool })

@@ -72,7 +72,8 @@ impl Sqlite {
             .connect_lazy_with(options(file).read_only(true).create_if_missing(false));
         let (units, inbox) = channel(WAITING);
         let path = file.to_owned();
-        let thread = std::thread::Builder::new().name("sqlite-writer".to_owned()).spawn(move || writer(&path, inbox))?;
+        let thread =
+            std::thread::Builder::new().name("sqlite-writer".to_owned()).spawn(move || writer(&path, inbox))?;
         Ok(Self { file: file.to_owned(), readers, units, thread: Arc::new(Mutex::new(Some(thread))) })
     }
 }

@@ -145,9 +145,7 @@ impl Tx<'_> {
                 let done = bound!(AssertSqlSafe(super::sqlite::words(sql)), args).execute(&mut **connection).await?;
                 Ok(done.rows_affected())
             }
-            Self::Postgres(connection) => {
-                Ok(bound!(sql, args).execute(&mut **connection).await?.rows_affected())
-            }
+            Self::Postgres(connection) => Ok(bound!(sql, args).execute(&mut **connection).await?.rows_affected()),
         }
     }
 }

@@ -48,7 +48,12 @@ async fn bench(kind: &str, large: i64) -> Result<()> {
     let accepted = begun.elapsed();
     let drained = drain(&queue, JOBS).await?;
     let whole = accepted + drained;
-    println!("{kind}: {:.0} no-op jobs/s ({:.0} accepted/s, {:.0} claimed and ended/s)", rate(JOBS, whole), rate(JOBS, accepted), rate(JOBS, drained));
+    println!(
+        "{kind}: {:.0} no-op jobs/s ({:.0} accepted/s, {:.0} claimed and ended/s)",
+        rate(JOBS, whole),
+        rate(JOBS, accepted),
+        rate(JOBS, drained)
+    );
     fill(&queue, 1000).await?;
     let small = rate(1000, drain(&queue, 1000).await?);
     fill(&queue, large).await?;

@@ -143,7 +143,13 @@ async fn storm(words: &[String]) -> Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let mut callers = Vec::new();
     for caller in 0..CALLERS {
-        let call = Caller { base: place.base(), accepted: Arc::clone(&accepted), sent: Arc::clone(&sent), stop: Arc::clone(&stop), jobs };
+        let call = Caller {
+            base: place.base(),
+            accepted: Arc::clone(&accepted),
+            sent: Arc::clone(&sent),
+            stop: Arc::clone(&stop),
+            jobs,
+        };
         callers.push(tokio::spawn(call.run(caller)));
     }
     let mut processes = (0..=WORKERS).map(|k| place.start(k)).collect::<Result<Vec<_>>>()?;
@@ -325,7 +331,10 @@ async fn settle(place: &Place, processes: &mut [Child], accepted: &BTreeMap<Stri
         }
     }
     let left = orphans(&place.folder.path().join("store"), &named).await?;
-    println!("{succeeded} succeeded once each, {failed} failed after three killed starts, {} artefacts right, {left} orphans", named.len());
+    println!(
+        "{succeeded} succeeded once each, {failed} failed after three killed starts, {} artefacts right, {left} orphans",
+        named.len()
+    );
     ensure!(left == 0, "{left} objects that no row names are left after the sweep");
     Ok(())
 }

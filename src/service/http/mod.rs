@@ -12,6 +12,7 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod workers;
 
 use crate::state::State;
 use axum::Router;
@@ -62,6 +63,7 @@ fn documented() -> OpenApiRouter<State> {
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
+        .merge(workers::router())
         .merge(session::router())
         .merge(health::router())
 }

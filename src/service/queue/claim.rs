@@ -130,8 +130,10 @@ impl Queue {
     /// The database's.
     pub async fn beat(&self, id: Uuid, fence: i64, beat: &Beat) -> sqlx::Result<Verdict> {
         let told = beat.clone();
-        let verdict =
-            self.db().write(Scope::System, move |tx| Box::pin(async move { beaten(tx, id, fence, &told).await })).await?;
+        let verdict = self
+            .db()
+            .write(Scope::System, move |tx| Box::pin(async move { beaten(tx, id, fence, &told).await }))
+            .await?;
         if beat.moved && verdict != Verdict::Lost {
             self.hint(id);
         }

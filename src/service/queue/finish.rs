@@ -50,7 +50,9 @@ fn out_of_memory(bound_mb: i64) -> Problem {
     Problem::new(
         StatusCode::UNPROCESSABLE_ENTITY,
         "job.memory",
-        format!("The job needed more than the {bound_mb} MiB that it may take. Send a smaller volume, or ask the operator for a worker with more memory."),
+        format!(
+            "The job needed more than the {bound_mb} MiB that it may take. Send a smaller volume, or ask the operator for a worker with more memory."
+        ),
     )
 }
 
@@ -80,7 +82,11 @@ async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Resu
         stage = CASE WHEN $3 = 'failed' THEN stage END, result = $5, attempt = attempt - $6, run_at = now_ms() + $7, \
         finished_at = CASE WHEN $3 = 'queued' THEN NULL ELSE now_ms() END, revision = revision + 1 \
         WHERE id = $1 AND fence = $2 AND state = 'running'";
-    let pause = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) { BACKOFF_MS * claim.attempt * claim.attempt } else { 0 };
+    let pause = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) {
+        BACKOFF_MS * claim.attempt * claim.attempt
+    } else {
+        0
+    };
     let values = args![
         &claim.id,
         claim.fence,
@@ -142,14 +148,8 @@ fn result_json(closing: &Closing) -> Option<String> {
 
 async fn name_artefact(tx: &mut Tx<'_>, job: &str, artefact: &ArtefactRow) -> sqlx::Result<()> {
     let sql = "INSERT INTO artefact (job, name, media_type, bytes, digest, object_key) VALUES ($1, $2, $3, $4, $5, $6)";
-    let values = args![
-        job,
-        &artefact.name,
-        &artefact.media_type,
-        artefact.bytes,
-        &artefact.digest,
-        &artefact.object_key
-    ];
+    let values =
+        args![job, &artefact.name, &artefact.media_type, artefact.bytes, &artefact.digest, &artefact.object_key];
     tx.run(sql, values).await?;
     Ok(())
 }

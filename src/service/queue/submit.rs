@@ -73,9 +73,7 @@ impl Queue {
 
     async fn submit_once(&self, job: &NewJob) -> sqlx::Result<Submitted> {
         let new = job.clone();
-        self.db()
-            .write(Scope::Tenant(&job.tenant), move |tx| Box::pin(async move { accepted(tx, &new).await }))
-            .await
+        self.db().write(Scope::Tenant(&job.tenant), move |tx| Box::pin(async move { accepted(tx, &new).await })).await
     }
 
     /// Cancels: a queued job at once, a running one by asking its worker (see the row's `cancel_requested`).

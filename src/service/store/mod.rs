@@ -4,16 +4,16 @@
 //! the key keeps a worker that lost its lease from overwriting the files of the one that holds it. An object exists
 //! for readers only once the job table names it; whatever else lies here is an orphan and is swept at start.
 
+use crate::config::{Config, StorePlace};
 use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
+use object_store::prefix::PrefixStore;
+use object_store::{ClientOptions, RetryConfig};
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
-use crate::config::{Config, StorePlace};
-use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
-use object_store::prefix::PrefixStore;
-use object_store::{ClientOptions, RetryConfig};
 use std::path::Path;
 use std::str::FromStr as _;
 use std::sync::Arc;
@@ -78,6 +78,9 @@ pub struct Input {
 #[derive(Clone, Debug)]
 pub struct Store {
     objects: Arc<dyn ObjectStore>,
+    /// The folder of a local store. A `kill -9` between writing and renaming leaves `NAME#1`, which object_store neither
+    /// lists nor deletes (the kill storm found scans that outlived their erasure so): folders are read and removed here.
+    folder: Option<std::path::PathBuf>,
 }
 
 /// `sha256:` and 64 hex digits.
@@ -137,7 +140,7 @@ impl Store {
             "" => Arc::new(builder.build()?),
             prefix => Arc::new(PrefixStore::new(builder.build()?, prefix)),
         };
-        Ok(Self { objects })
+        Ok(Self { objects, folder: None })
     }
 
     /// A store in a folder of this machine, made if missing; every put is synced to disk before it returns.
@@ -147,7 +150,7 @@ impl Store {
     pub fn local(folder: &Path) -> Result<Self, Error> {
         std::fs::create_dir_all(folder)?;
         let objects = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true).with_automatic_cleanup(true);
-        Ok(Self { objects: Arc::new(objects) })
+        Ok(Self { objects: Arc::new(objects), folder: Some(folder.to_owned()) })
     }
 
     /// Digests of an input's files and of its manifest, without storing anything.
@@ -272,6 +275,12 @@ impl Store {
     }
 
     async fn erase(&self, prefix: Key) -> Result<(), Error> {
+        if let Some(folder) = &self.folder {
+            return match tokio::fs::remove_dir_all(folder.join(prefix.as_ref())).await {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error.into()),
+                _ => Ok(()),
+            };
+        }
         let found = self.objects.list(Some(&prefix)).map_ok(|meta| meta.location).boxed();
         let mut deleted = self.objects.delete_stream(found);
         while let Some(one) = deleted.next().await {
@@ -289,8 +298,8 @@ impl Store {
     /// # Errors
     /// The store's.
     pub async fn jobs(&self) -> Result<Vec<Uuid>, Error> {
-        let listed = self.objects.list_with_delimiter(Some(&Key::from("jobs"))).await?;
-        Ok(listed.common_prefixes.iter().filter_map(|key| Uuid::parse_str(key.filename()?).ok()).collect())
+        let names = self.folders(&Key::from("jobs")).await?;
+        Ok(names.iter().filter_map(|name| Uuid::parse_str(name).ok()).collect())
     }
 
     /// Fences under which something of a job is stored.
@@ -299,8 +308,24 @@ impl Store {
     /// The store's.
     pub async fn attempts(&self, job: Uuid) -> Result<Vec<i64>, Error> {
         let prefix = Key::from_iter(["jobs", &job.to_string(), "artefacts"]);
-        let listed = self.objects.list_with_delimiter(Some(&prefix)).await?;
-        Ok(listed.common_prefixes.iter().filter_map(|key| key.filename()?.parse().ok()).collect())
+        Ok(self.folders(&prefix).await?.iter().filter_map(|name| name.parse().ok()).collect())
+    }
+
+    /// Names one level below a prefix.
+    async fn folders(&self, prefix: &Key) -> Result<Vec<String>, Error> {
+        let Some(folder) = &self.folder else {
+            let listed = self.objects.list_with_delimiter(Some(prefix)).await?;
+            return Ok(listed.common_prefixes.iter().filter_map(|key| Some(key.filename()?.to_owned())).collect());
+        };
+        let mut entries = match tokio::fs::read_dir(folder.join(prefix.as_ref())).await {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let mut names = Vec::new();
+        while let Some(entry) = entries.next_entry().await? {
+            names.push(entry.file_name().to_string_lossy().into_owned());
+        }
+        Ok(names)
     }
 
     /// Puts and removes a small object: whether the store takes writes.

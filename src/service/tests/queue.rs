@@ -379,7 +379,8 @@ async fn retention_ends(b: Bench) {
 
 async fn webhooks_get_a_message_in_the_same_commit(b: Bench) {
     let q = &b.queue;
-    sql(q, "INSERT INTO webhook (id, tenant, url, secret, created_at) VALUES ('h', 'default', 'https://x', 's', 0)").await;
+    sql(q, "INSERT INTO webhook (id, tenant, url, secret, created_at) VALUES ('h', 'default', 'https://x', 's', 0)")
+        .await;
     let id = add(q, |_| {}).await;
     let held = claim(q).await.unwrap();
     q.close(&held, &success()).await.unwrap();

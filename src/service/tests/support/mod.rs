@@ -29,6 +29,9 @@ step("read", 0.1)
 do = plan.get("do", "work")
 if do == "crash": os.kill(os.getpid(), 9)
 if do == "silent": sys.exit(0)
+if do == "allocate":
+    hoard = []
+    while True: hoard.append(bytearray(1 << 24))
 if do == "input":
     print(json.dumps({"error": {"status": 422, "code": "stack.black", "detail": "every pixel is 0",
           "errors": [{"code": "stack.black", "message": "every pixel is 0", "where": {"slice": 3}}]}}), flush=True)
@@ -140,11 +143,16 @@ pub fn client() -> Client {
 }
 
 pub fn upload(client: &Client, base: &str, plan: &Value) -> RequestBuilder {
+    upload_to(client, &format!("{base}/v1/jobs"), plan)
+}
+
+/// The same to an address with a query.
+pub fn upload_to(client: &Client, url: &str, plan: &Value) -> RequestBuilder {
     let form = multipart::Form::new()
         .text("plan", plan.to_string())
         .part("input", multipart::Part::bytes(b"second".to_vec()).file_name("scan/b.png"))
         .part("input", multipart::Part::bytes(b"first".to_vec()).file_name("scan/a.png"));
-    client.post(format!("{base}/v1/jobs")).multipart(form)
+    client.post(url).multipart(form)
 }
 
 pub async fn ended(client: &Client, base: &str, id: &str) -> Value {
