@@ -74,6 +74,9 @@ pub(crate) struct Serve {
     /// Longest time of one job, seconds; 0: no bound.
     #[arg(long, default_value_t = 21_600)]
     pub(crate) job_seconds: u64,
+    /// A host to which webhooks may go though its network is not public; may be given several times.
+    #[arg(long = "webhook-host")]
+    pub(crate) webhook_hosts: Vec<String>,
     /// No API keys: only on a loopback address.
     #[arg(long)]
     pub(crate) no_auth: bool,

@@ -106,6 +106,7 @@ fn config(a: Serve) -> Config {
         threads: a.threads.unwrap_or(0),
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
+        webhook_hosts: a.webhook_hosts,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         ..data_config(a.data)
     }

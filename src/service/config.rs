@@ -57,6 +57,8 @@ pub struct Config {
     pub executable_args: Vec<String>,
     /// Where machines share a store, objects that no row names are swept once they are this old, seconds. Default 3600.
     pub sweep_seconds: u64,
+    /// Hosts to which webhooks may go though they lie in a network that is not public, by plain http too. Default none.
+    pub webhook_hosts: Vec<String>,
     /// Largest request body, bytes. Default 2 GiB.
     pub max_body: u64,
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
@@ -82,6 +84,7 @@ impl Default for Config {
             memory_mb: 0,
             job_seconds: 6 * 3600,
             sweep_seconds: 3600,
+            webhook_hosts: Vec::new(),
             workers: 1,
             threads: 0,
             auth: Auth::Required,

@@ -21,6 +21,7 @@ pub mod state;
 pub mod store;
 pub mod telemetry;
 pub mod tls;
+pub mod webhooks;
 pub mod worker;
 
 pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes};

@@ -31,6 +31,28 @@ pub fn base64(bytes: &[u8]) -> String {
     text
 }
 
+/// The bytes of base 64 (RFC 4648, with or without padding); `None` for anything else.
+pub fn base64_bytes(text: &str) -> Option<Vec<u8>> {
+    let (mut bytes, mut bits, mut held) = (Vec::new(), 0_u32, 0);
+    for digit in text.trim_end_matches('=').bytes() {
+        let value = match digit {
+            b'A'..=b'Z' => digit - b'A',
+            b'a'..=b'z' => digit - b'a' + 26,
+            b'0'..=b'9' => digit - b'0' + 52,
+            b'+' => 62,
+            b'/' => 63,
+            _ => return None,
+        };
+        bits = (bits << 6) | u32::from(value);
+        held += 6;
+        if held >= 8 {
+            held -= 8;
+            bytes.push(u8::try_from((bits >> held) & 0xff).ok()?);
+        }
+    }
+    Some(bytes)
+}
+
 /// Media type of VTK XML files.
 pub const VTK: &str = "application/x-vtk+xml";
 
@@ -131,6 +153,7 @@ mod tests {
     fn base64_as_rfc_4648_has_it() {
         for (plain, coded) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg==")] {
             assert_eq!(base64(plain.as_bytes()), coded);
+            assert_eq!(base64_bytes(coded).as_deref(), Some(plain.as_bytes()));
         }
     }
 

@@ -67,6 +67,7 @@ impl Server {
         let worker = parts.work(&config, &shutdown, &mut tasks).await?;
         tasks.spawn(keeping::keep(parts.queue.clone(), parts.store.clone(), Arc::clone(&config), shutdown.clone()));
         tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
+        tasks.spawn(crate::webhooks::deliver(parts.queue.db().clone(), Arc::clone(&config), shutdown.clone()));
         let state = State {
             uploads: Arc::new(Semaphore::new(upload_units(&config))),
             config: Arc::clone(&config),

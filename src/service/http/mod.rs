@@ -12,6 +12,7 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod webhooks;
 mod workers;
 
 use crate::state::State;
@@ -40,6 +41,7 @@ const SMALL_BODY: usize = 64 << 10;
     tags(
         (name = "jobs", description = "Send a scan, follow it, end it"),
         (name = "results", description = "What a job made"),
+        (name = "webhooks", description = "Be told when a job ends"),
         (name = "monitoring", description = "Is it well, and how busy is it")
     )
 )]
@@ -64,6 +66,7 @@ fn documented() -> OpenApiRouter<State> {
         .merge(artefacts::router())
         .merge(stats::router())
         .merge(workers::router())
+        .merge(webhooks::router())
         .merge(session::router())
         .merge(health::router())
 }

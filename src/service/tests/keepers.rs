@@ -203,3 +203,49 @@ async fn an_allocation_without_end_ends_the_job_and_not_the_worker() {
     assert_eq!(service.ended(&next).await["state"], "succeeded");
     service.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_webhook_is_told_until_it_has_heard() {
+    use axum::http::HeaderMap;
+    let (heard, mut messages) = tokio::sync::mpsc::unbounded_channel::<(HeaderMap, String)>();
+    let calls = std::sync::Arc::new(std::sync::atomic::AtomicUsize::new(0));
+    let receiver = axum::Router::new().route(
+        "/hook",
+        axum::routing::post(move |headers: HeaderMap, body: String| {
+            // The first attempt fails.
+            let first = calls.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0;
+            heard.send((headers, body)).unwrap();
+            async move { if first { StatusCode::INTERNAL_SERVER_ERROR } else { StatusCode::NO_CONTENT } }
+        }),
+    );
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://127.0.0.1:{}/hook", listener.local_addr().unwrap().port());
+    tokio::spawn(async move { axum::serve(listener, receiver).await });
+    let service = Service::with(|config| config.webhook_hosts = vec!["127.0.0.1".to_owned()]).await;
+    let add = |url: &str| service.request(Method::POST, "/v1/webhooks").json(&json!({"url": url})).send();
+    assert_eq!(problem(add("https://localhost/").await.unwrap(), 422).await, "webhook.url");
+    let made = support::json(add(&url).await.unwrap()).await;
+    let secret = made["secret"].as_str().unwrap();
+    let listed = service.json("/v1/webhooks").await;
+    assert_eq!((&listed["items"][0]["url"], listed["items"][0].get("secret")), (&json!(url), None));
+    let id = service.submit(&json!({})).await;
+    service.ended(&id).await;
+    let mut seen = Vec::new();
+    for _ in 0..2 {
+        let message = tokio::time::timeout(std::time::Duration::from_secs(12), messages.recv()).await.unwrap();
+        seen.push(message.unwrap());
+    }
+    assert_eq!(seen[0].1, seen[1].1, "the second attempt tells the same");
+    let (headers, body) = &seen[1];
+    let text = |name: &str| headers[name].to_str().unwrap();
+    assert_eq!(text("webhook-id"), seen[0].0["webhook-id"].to_str().unwrap());
+    let stamp: u64 = text("webhook-timestamp").parse().unwrap();
+    let signed = service::webhooks::signature(secret, text("webhook-id"), stamp, body).unwrap();
+    assert_eq!(text("webhook-signature"), signed);
+    let body: serde_json::Value = serde_json::from_str(body).unwrap();
+    assert_eq!((&body["type"], &body["data"]["id"]), (&json!("job.succeeded"), &json!(id)));
+    let path = format!("/v1/webhooks/{}", made["id"].as_str().unwrap());
+    assert_eq!(service.request(Method::DELETE, &path).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(problem(service.request(Method::DELETE, &path).send().await.unwrap(), 404).await, "not_found");
+    service.stop().await;
+}
