@@ -28,6 +28,8 @@ pub(crate) enum Command {
     Demo(Demo),
     /// Bring the database to this version's schema.
     Migrate(Data),
+    /// Copy the SQLite database consistently while the service runs.
+    Backup(Backup),
     /// API keys.
     Key(Key),
     /// Check that no line of the audit was changed, moved or taken out.
@@ -122,6 +124,15 @@ pub(crate) enum KeyAction {
         /// The key's id, from the list.
         id: String,
     },
+}
+
+#[derive(Args)]
+pub(crate) struct Backup {
+    #[command(flatten)]
+    pub(crate) data: Data,
+    /// File to write; it must not exist.
+    #[arg(long)]
+    pub(crate) out: PathBuf,
 }
 
 #[derive(Args)]

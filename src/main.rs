@@ -22,6 +22,7 @@ fn main() -> ExitCode {
         Command::Serve(a) => serving::serve(a),
         Command::Work(a) => serving::work(a),
         Command::Migrate(a) => serving::migrate(a),
+        Command::Backup(a) => serving::backup(a),
         Command::Key(a) => serving::key(a),
         Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),

@@ -1,6 +1,6 @@
 //! `serve`, `work`, `migrate`, `key`, `openapi`.
 
-use crate::arguments::{Data, Key, KeyAction, Serve, VerifyAudit};
+use crate::arguments::{Backup, Data, Key, KeyAction, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
 use service::auth::{Role, keys, keys::NewKey};
 use service::{Auth, Config, Problem, audit};
@@ -20,6 +20,16 @@ pub(crate) fn work(a: Serve) -> ExitCode {
 /// Bring the database up to date.
 pub(crate) fn migrate(a: Data) -> ExitCode {
     with_runtime(service::migrate(data_config(a)))
+}
+
+/// Copy the database.
+pub(crate) fn backup(a: Backup) -> ExitCode {
+    with_runtime(async move {
+        let db = service::open_database(&data_config(a.data)).await?;
+        let copied = db.backup(&a.out).await;
+        db.close().await;
+        copied
+    })
 }
 
 /// Make, list or revoke API keys.

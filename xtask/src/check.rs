@@ -16,7 +16,9 @@ pub(crate) fn all() -> Result<()> {
     let mut test = shell::command("cargo");
     tools::postgres()?;
     // Its lack is then a failure of the queue's tests, not a reason to skip them.
-    test.args(["test", "--workspace", "--quiet"]).env("VASCULUM_POSTGRES", "required");
+    test.args(["test", "--workspace", "--quiet"])
+        .env("VASCULUM_POSTGRES", "required")
+        .env("VASCULUM_S3S", tools::s3()?);
     shell::run(test)?;
     let binary = tools::release_binary()?;
     let work = fresh_folder()?;

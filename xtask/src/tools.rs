@@ -76,6 +76,20 @@ pub(crate) fn postgres() -> Result<()> {
     apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
 }
 
+/// An S3 server that checks signatures and checksums, for the store's tests; its program.
+pub(crate) fn s3() -> Result<PathBuf> {
+    let root = folder()?.join("s3s");
+    let program = root.join("bin/s3s-fs");
+    if !program.exists() {
+        let mut install = shell::command("cargo");
+        install
+            .args(["install", "s3s-fs", "--version", "0.14.1", "--features", "binary", "--locked", "--root"])
+            .arg(&root);
+        shell::run(install)?;
+    }
+    Ok(program)
+}
+
 /// Headless browser for the portal's test.
 pub(crate) fn browser() -> Result<()> {
     if shell::has("chromium") {

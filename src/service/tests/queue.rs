@@ -72,6 +72,7 @@ on_both! {
     pages_follow_the_key
     workers_are_on_the_roll
     a_newer_schema_is_refused
+    a_backup_holds_every_job
     hints_travel_or_are_not_needed
     the_order_of_claims_does_not_slow_with_the_backlog
 }
@@ -458,6 +459,21 @@ async fn a_newer_schema_is_refused(b: Bench) {
     sql(&b.queue, later).await;
     let refused = format!("{:#}", Db::open(&b.config).await.unwrap_err());
     assert!(refused.contains("9999") && refused.contains("older than the data"), "{refused}");
+}
+
+async fn a_backup_holds_every_job(b: Bench) {
+    let id = add(&b.queue, |_| {}).await;
+    let file = b._folder.path().join("copy.sqlite");
+    let copied = b.queue.db().backup(&file).await;
+    if b.config.database_url.is_some() {
+        assert!(copied.unwrap_err().to_string().contains("pg_dump"));
+        return;
+    }
+    copied.unwrap();
+    assert!(b.queue.db().backup(&file).await.is_err(), "a backup is never written over");
+    let config = Config { database_url: Some(format!("sqlite:{}", file.display())), ..b.config.clone() };
+    let restored = Queue::new(Db::open(&config).await.unwrap());
+    assert_eq!(claim(&restored).await.unwrap().uuid(), id);
 }
 
 async fn hints_travel_or_are_not_needed(b: Bench) {
