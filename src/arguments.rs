@@ -28,8 +28,12 @@ pub(crate) enum Command {
     Demo(Demo),
     /// Bring the database to this version's schema.
     Migrate(Data),
+    /// Copy the SQLite database consistently while the service runs.
+    Backup(Backup),
     /// API keys.
     Key(Key),
+    /// Check that no line of the audit was changed, moved or taken out.
+    VerifyAudit(VerifyAudit),
     /// Print the API's description (OpenAPI 3.1, YAML).
     Openapi,
     /// Print the version.
@@ -44,10 +48,11 @@ pub(crate) struct Data {
     /// Database, artefacts and working folders live here.
     #[arg(long, default_value = "vasculum-data", env = "VASCULUM_DATA_DIR")]
     pub(crate) data_dir: PathBuf,
-    /// sqlite:PATH (default: inside the data folder).
+    /// sqlite:PATH (default: inside the data folder) or postgres://USER:PASSWORD@HOST/DATABASE.
     #[arg(long, env = "VASCULUM_DATABASE_URL")]
     pub(crate) database_url: Option<String>,
-    /// file:PATH (default: inside the data folder).
+    /// file:PATH (default: inside the data folder) or s3://BUCKET/PREFIX (VASCULUM_S3_ENDPOINT, VASCULUM_S3_REGION,
+    /// VASCULUM_S3_ACCESS_KEY_ID, VASCULUM_S3_SECRET_ACCESS_KEY).
     #[arg(long, env = "VASCULUM_STORE_URL")]
     pub(crate) store_url: Option<String>,
 }
@@ -65,6 +70,15 @@ pub(crate) struct Serve {
     /// Threads of each job (default: all cores; results do not depend on it).
     #[arg(long)]
     pub(crate) threads: Option<usize>,
+    /// Memory of all jobs together, MiB (default: three quarters of what is free at start).
+    #[arg(long, default_value_t = 0, env = "VASCULUM_MEMORY_MB")]
+    pub(crate) memory_mb: u64,
+    /// Longest time of one job, seconds; 0: no bound.
+    #[arg(long, default_value_t = 21_600)]
+    pub(crate) job_seconds: u64,
+    /// A host to which webhooks may go though its network is not public; may be given several times.
+    #[arg(long = "webhook-host")]
+    pub(crate) webhook_hosts: Vec<String>,
     /// No API keys: only on a loopback address.
     #[arg(long)]
     pub(crate) no_auth: bool,
@@ -85,7 +99,49 @@ pub(crate) enum KeyAction {
         /// What the key is for.
         #[arg(long, default_value = "key")]
         name: String,
+        /// upload, read, admin or auditor.
+        #[arg(long, default_value = "admin")]
+        role: String,
+        /// Whose jobs the key sees; made if it is new.
+        #[arg(long, default_value = "default")]
+        tenant: String,
+        /// Requests in a minute (default: no bound).
+        #[arg(long)]
+        requests_per_minute: Option<i64>,
+        /// Largest upload, bytes (default: the service's bound).
+        #[arg(long)]
+        max_bytes: Option<i64>,
     },
+    /// List every key: id, tenant, role, label; never the key itself.
+    List {
+        #[command(flatten)]
+        data: Data,
+    },
+    /// Revoke a key at once.
+    Revoke {
+        #[command(flatten)]
+        data: Data,
+        /// The key's id, from the list.
+        id: String,
+    },
+}
+
+#[derive(Args)]
+pub(crate) struct Backup {
+    #[command(flatten)]
+    pub(crate) data: Data,
+    /// File to write; it must not exist.
+    #[arg(long)]
+    pub(crate) out: PathBuf,
+}
+
+#[derive(Args)]
+pub(crate) struct VerifyAudit {
+    #[command(flatten)]
+    pub(crate) data: Data,
+    /// Also print every line as a FHIR R4 AuditEvent resource (one JSON object per line).
+    #[arg(long)]
+    pub(crate) fhir: bool,
 }
 
 #[derive(Args)]

@@ -12,6 +12,7 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    service::tls::provide();
     let arguments = Arguments::parse();
     match arguments.command {
         Command::Run(a) => jobs::run(&a),
@@ -21,7 +22,9 @@ fn main() -> ExitCode {
         Command::Serve(a) => serving::serve(a),
         Command::Work(a) => serving::work(a),
         Command::Migrate(a) => serving::migrate(a),
+        Command::Backup(a) => serving::backup(a),
         Command::Key(a) => serving::key(a),
+        Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),
         Command::Openapi => serving::openapi(),
         Command::Version => {

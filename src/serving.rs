@@ -1,8 +1,9 @@
 //! `serve`, `work`, `migrate`, `key`, `openapi`.
 
-use crate::arguments::{Data, Key, KeyAction, Serve};
+use crate::arguments::{Backup, Data, Key, KeyAction, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
-use service::{Auth, Config, Problem};
+use service::auth::{Role, keys, keys::NewKey};
+use service::{Auth, Config, Problem, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -21,11 +22,71 @@ pub(crate) fn migrate(a: Data) -> ExitCode {
     with_runtime(service::migrate(data_config(a)))
 }
 
-/// Make an API key.
-pub(crate) fn key(a: Key) -> ExitCode {
-    let KeyAction::Create { data, name } = a.action;
+/// Copy the database.
+pub(crate) fn backup(a: Backup) -> ExitCode {
     with_runtime(async move {
-        println!("{}", service::create_key(data_config(data), &name).await?);
+        let db = service::open_database(&data_config(a.data)).await?;
+        let copied = db.backup(&a.out).await;
+        db.close().await;
+        copied
+    })
+}
+
+/// Make, list or revoke API keys.
+pub(crate) fn key(a: Key) -> ExitCode {
+    with_runtime(async move {
+        match a.action {
+            KeyAction::Create { data, name, role, tenant, requests_per_minute, max_bytes } => {
+                let role =
+                    Role::of(&role).ok_or_else(|| anyhow::anyhow!("roles are upload, read, admin and auditor"))?;
+                let db = service::open_database(&data_config(data)).await?;
+                let new = NewKey { label: name, role, tenant, requests_per_minute, max_bytes };
+                println!("{}", keys::create(&db, new).await?);
+                db.close().await;
+            }
+            KeyAction::List { data } => {
+                let db = service::open_database(&data_config(data)).await?;
+                println!("{:<38}{:<16}{:<10}{:<10}label", "id", "tenant", "role", "state");
+                for key in keys::list(&db).await? {
+                    let state = if key.revoked_at.is_some() { "revoked" } else { "valid" };
+                    println!("{:<38}{:<16}{:<10}{state:<10}{}", key.id, key.tenant, key.role, key.label);
+                }
+                db.close().await;
+            }
+            KeyAction::Revoke { data, id } => {
+                let db = service::open_database(&data_config(data)).await?;
+                let revoked = keys::revoke(&db, &id).await?;
+                db.close().await;
+                anyhow::ensure!(revoked, "there is no valid key {id}; `vasculum key list` shows them");
+            }
+        }
+        Ok(())
+    })
+}
+
+/// Check the audit's chain, and print it as FHIR AuditEvent resources if wanted.
+pub(crate) fn verify_audit(a: VerifyAudit) -> ExitCode {
+    with_runtime(async move {
+        let db = service::open_database(&data_config(a.data)).await?;
+        let mut after = 0;
+        if a.fhir {
+            loop {
+                let (events, last) = audit::fhir(&db, None, after).await?;
+                if events.is_empty() {
+                    break;
+                }
+                after = last;
+                events.iter().for_each(|event| println!("{event}"));
+            }
+        }
+        let verdict = audit::verify(&db).await?;
+        db.close().await;
+        match verdict {
+            audit::Verdict::Whole { lines } => eprintln!("the audit is whole: {lines} lines"),
+            audit::Verdict::Broken { line } => {
+                anyhow::bail!("the audit is broken at line {line}: it was changed, moved or taken out")
+            }
+        }
         Ok(())
     })
 }
@@ -41,6 +102,9 @@ fn data_config(a: Data) -> Config {
         data_dir: a.data_dir,
         database_url: a.database_url,
         store_url: a.store_url,
+        s3: std::env::vars()
+            .filter_map(|(name, value)| Some((name.strip_prefix("VASCULUM_S3_")?.to_owned(), value)))
+            .collect(),
         intake,
         check_plan,
         ..Config::default()
@@ -52,6 +116,9 @@ fn config(a: Serve) -> Config {
         listen: a.listen,
         workers: a.workers,
         threads: a.threads.unwrap_or(0),
+        memory_mb: a.memory_mb,
+        job_seconds: a.job_seconds,
+        webhook_hosts: a.webhook_hosts,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         ..data_config(a.data)
     }

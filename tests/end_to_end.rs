@@ -225,6 +225,7 @@ impl Drop for Server {
 /// All requests of these tests share one runtime: a response outlives the call that made it.
 fn block<T>(future: impl Future<Output = T>) -> T {
     static RUNTIME: OnceLock<tokio::runtime::Runtime> = OnceLock::new();
+    service::tls::provide();
     RUNTIME.get_or_init(|| tokio::runtime::Runtime::new().unwrap()).block_on(future)
 }
 

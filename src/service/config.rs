@@ -32,20 +32,33 @@ pub struct Config {
     /// Address to listen on; port 0 takes a free one, printed and written to `<data_dir>/listen`.
     /// Default 127.0.0.1:8080.
     pub listen: SocketAddr,
-    /// `sqlite:PATH`; default `<data_dir>/vasculum.sqlite`. Other databases are refused at start.
+    /// `sqlite:PATH` or `postgres://USER:PASSWORD@HOST/DATABASE`; default `sqlite:<data_dir>/vasculum.sqlite`.
     pub database_url: Option<String>,
-    /// `file:PATH` of the artefact folder; default `<data_dir>/store`. Other stores are refused at start.
+    /// Connections to PostgreSQL that this process may hold (plus one for beats and one for hints). Default 8.
+    pub database_connections: u32,
+    /// `file:PATH` or `s3://BUCKET[/PREFIX]` (keys and endpoint in [`Config::s3`]); default `<data_dir>/store`.
     pub store_url: Option<String>,
+    /// Settings of an S3 store by their names in AWS's tools without `AWS_`, such as `endpoint` or `region`.
+    pub s3: Vec<(String, String)>,
     /// Jobs that run at the same time, each in its own process. 0: this process only serves. Default 1.
     pub workers: usize,
     /// `--threads` of each job's process; 0 lets the process take all cores. Default 0.
     pub threads: usize,
+    /// Memory that all jobs of this process may take together, MiB; 0: three quarters of what the machine has free at
+    /// start. A job's process is bound to its share. Default 0.
+    pub memory_mb: u64,
+    /// Longest time of one start of a job, seconds; 0: no bound. Default 6 hours.
+    pub job_seconds: u64,
     /// Who may call. Default [`Auth::Required`].
     pub auth: Auth,
     /// The program whose `exec-job` sub-command runs one job. Default: this program.
     pub executable: PathBuf,
     /// Arguments put before `exec-job` (none by default; an interpreter's script in tests).
     pub executable_args: Vec<String>,
+    /// Where machines share a store, objects that no row names are swept once they are this old, seconds. Default 3600.
+    pub sweep_seconds: u64,
+    /// Hosts to which webhooks may go though they lie in a network that is not public, by plain http too. Default none.
+    pub webhook_hosts: Vec<String>,
     /// Largest request body, bytes. Default 2 GiB.
     pub max_body: u64,
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
@@ -65,7 +78,13 @@ impl Default for Config {
             data_dir: PathBuf::from("vasculum-data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             database_url: None,
+            database_connections: 8,
             store_url: None,
+            s3: Vec::new(),
+            memory_mb: 0,
+            job_seconds: 6 * 3600,
+            sweep_seconds: 3600,
+            webhook_hosts: Vec::new(),
             workers: 1,
             threads: 0,
             auth: Auth::Required,
@@ -89,23 +108,46 @@ impl Config {
         match &self.database_url {
             None => Ok(self.data_dir.join("vasculum.sqlite")),
             Some(url) => path_of(url, "sqlite:").ok_or_else(|| {
-                anyhow::anyhow!("this version keeps its jobs in SQLite: --database-url must be sqlite:PATH, not {url}")
+                anyhow::anyhow!("--database-url must be sqlite:PATH or postgres://USER:PASSWORD@HOST/DATABASE")
             }),
         }
     }
 
-    /// The artefact folder.
+    /// Where artefacts go.
     ///
     /// # Errors
-    /// A `store_url` of another scheme.
-    pub fn store_dir(&self) -> anyhow::Result<PathBuf> {
-        match &self.store_url {
-            None => Ok(self.data_dir.join("store")),
-            Some(url) => path_of(url, "file:").ok_or_else(|| {
-                anyhow::anyhow!("this version keeps artefacts in a folder: --store-url must be file:PATH, not {url}")
-            }),
+    /// A `store_url` that is not understood.
+    pub fn store_place(&self) -> anyhow::Result<StorePlace> {
+        let Some(url) = &self.store_url else { return Ok(StorePlace::Folder(self.data_dir.join("store"))) };
+        if let Some(rest) = url.strip_prefix("s3://") {
+            let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+            anyhow::ensure!(bucket.len() >= 3, "a bucket's name has three characters or more: {url}");
+            return Ok(StorePlace::S3 { bucket: bucket.to_owned(), prefix: prefix.trim_matches('/').to_owned() });
         }
+        let folder = path_of(url, "file:");
+        folder
+            .map(StorePlace::Folder)
+            .ok_or_else(|| anyhow::anyhow!("--store-url must be file:PATH or s3://BUCKET/PREFIX, not {url}"))
     }
+
+    /// Whether other machines may use the same database.
+    pub fn is_shared(&self) -> bool {
+        self.database_url.as_deref().is_some_and(|url| url.starts_with("postgres"))
+    }
+}
+
+/// A store's place.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StorePlace {
+    /// A folder of this machine.
+    Folder(PathBuf),
+    /// A bucket and a prefix inside it.
+    S3 {
+        /// Bucket.
+        bucket: String,
+        /// Prefix without slashes at its ends; may be empty.
+        prefix: String,
+    },
 }
 
 /// The path of `scheme:PATH` or `scheme://PATH`.

@@ -101,6 +101,11 @@ impl Problem {
         self
     }
 
+    /// A disk is full: 507, with the time after which it is worth trying again.
+    pub fn storage_full(detail: &str) -> Self {
+        Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage.full", detail).with_header("retry-after", "60")
+    }
+
     /// No such job, artefact or page, for this tenant.
     pub fn not_found(what: &str) -> Self {
         Self::new(StatusCode::NOT_FOUND, "not_found", format!("There is no such {what}, or it is not yours."))
@@ -146,8 +151,23 @@ impl std::error::Error for Problem {}
 
 impl From<sqlx::Error> for Problem {
     fn from(error: sqlx::Error) -> Self {
-        if matches!(error, sqlx::Error::PoolTimedOut | sqlx::Error::Io(_)) {
-            tracing::error!(cause = %error, "database away");
+        let text = error.to_string();
+        if FULL.iter().any(|words| text.contains(words)) {
+            tracing::error!(cause = %text, "database full");
+            return Self::storage_full("The disk of the database is full. Nothing was accepted; tell the operator.");
+        }
+        let away = matches!(
+            error,
+            sqlx::Error::PoolTimedOut
+                | sqlx::Error::PoolClosed
+                | sqlx::Error::WorkerCrashed
+                | sqlx::Error::Io(_)
+                | sqlx::Error::Tls(_)
+        );
+        let code = error.as_database_error().and_then(|e| e.code().map(|c| c.into_owned()));
+        // Classes 08 and 57 of PostgreSQL: the connection broke, or the server is shutting down or starting.
+        if away || code.is_some_and(|c| c.len() == 5 && (c.starts_with("08") || c.starts_with("57"))) {
+            tracing::error!(cause = %text, "database away");
             return Self::new(
                 StatusCode::SERVICE_UNAVAILABLE,
                 "database.away",
@@ -159,9 +179,27 @@ impl From<sqlx::Error> for Problem {
     }
 }
 
+/// What SQLite, PostgreSQL and the operating system say when a disk is full.
+const FULL: &[&str] =
+    &["database or disk is full", "No space left on device", "disk quota exceeded", "Disk quota exceeded"];
+
 impl From<crate::store::Error> for Problem {
     fn from(error: crate::store::Error) -> Self {
-        Self::internal(error)
+        let text = format!("{:#}", anyhow::Error::new(error));
+        if FULL.iter().any(|words| text.contains(words)) {
+            tracing::error!(cause = %text, "store full");
+            return Self::storage_full("The artefact store is full. Nothing was accepted; tell the operator.");
+        }
+        if text.starts_with("artefact store:") && !text.contains("not found") {
+            tracing::error!(cause = %text, "store away");
+            return Self::new(
+                StatusCode::SERVICE_UNAVAILABLE,
+                "store.away",
+                "The artefact store does not answer at the moment. Nothing was accepted; try again.",
+            )
+            .with_header("retry-after", "5");
+        }
+        Self::internal(text)
     }
 }
 

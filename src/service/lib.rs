@@ -6,23 +6,27 @@
 //! Promises: a 202 is given after the job is committed and synced; a job ends in exactly one final state, whoever is
 //! killed on the way; a reader sees only artefacts that the job table names. See ARCHITECTURE.md for the walk through.
 
+pub mod audit;
 pub mod auth;
 pub mod config;
 pub mod db;
 pub mod error;
 mod http;
 pub mod intake;
+mod keeping;
 pub mod media;
 pub mod queue;
 mod server;
 pub mod state;
 pub mod store;
 pub mod telemetry;
+pub mod tls;
+pub mod webhooks;
 pub mod worker;
 
 pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes};
 pub use error::{PROBLEM_JSON, Problem, place_json};
-pub use server::{Server, create_key, migrate, serve, work};
+pub use server::{Server, migrate, open_database, serve, work};
 
 /// The OpenAPI 3.1 document as YAML; the same bytes for the same version.
 pub fn openapi() -> String {

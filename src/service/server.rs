@@ -4,11 +4,12 @@ use crate::auth;
 use crate::config::{Auth, Config};
 use crate::db::Db;
 use crate::http;
-use crate::queue::{JobState, Queue};
+use crate::keeping;
+use crate::queue::Queue;
 use crate::state::{State, UPLOAD_UNIT};
 use crate::store::Store;
 use crate::telemetry;
-use crate::worker::{Heartbeat, Owner, Worker};
+use crate::worker::{Heartbeat, Memory, Owner, Worker};
 use anyhow::{Context as _, bail};
 use std::fs::{File, TryLockError};
 use std::net::SocketAddr;
@@ -19,7 +20,6 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
-use uuid::Uuid;
 
 /// How long open connections may go on after the stop.
 const FAREWELL: Duration = Duration::from_secs(3);
@@ -45,9 +45,14 @@ impl Server {
         if config.auth == Auth::None && !config.listen.ip().is_loopback() {
             bail!("refusing to serve {} without keys: leave out --no-auth, or listen on 127.0.0.1", config.listen);
         }
+        crate::tls::provide();
         let config = Arc::new(config);
         std::fs::create_dir_all(&config.data_dir)
             .with_context(|| format!("cannot make the data folder {}", config.data_dir.display()))?;
+        anyhow::ensure!(
+            !config.is_shared() || config.workers == 0 || config.store_url.is_some(),
+            "workers of several machines need one store: give --store-url with PostgreSQL (or --workers 0)"
+        );
         let lock = lock(&config.data_dir)?;
         let listener =
             TcpListener::bind(config.listen).await.with_context(|| format!("cannot listen on {}", config.listen))?;
@@ -60,7 +65,9 @@ impl Server {
             Auth::None => None,
         };
         let worker = parts.work(&config, &shutdown, &mut tasks).await?;
-        tasks.spawn(sweep(parts.queue.clone(), parts.store.clone(), Uuid::now_v7()));
+        tasks.spawn(keeping::keep(parts.queue.clone(), parts.store.clone(), Arc::clone(&config), shutdown.clone()));
+        tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
+        tasks.spawn(crate::webhooks::deliver(parts.queue.db().clone(), Arc::clone(&config), shutdown.clone()));
         let state = State {
             uploads: Arc::new(Semaphore::new(upload_units(&config))),
             config: Arc::clone(&config),
@@ -114,8 +121,8 @@ struct Parts {
 
 impl Parts {
     async fn open(config: &Config) -> anyhow::Result<Self> {
-        let queue = Queue::new(Db::open(&config.database_file()?).await?);
-        let store = Store::local(&config.store_dir()?)?;
+        let queue = Queue::new(Db::open(config).await?);
+        let store = Store::open(config)?;
         Ok(Self { queue, store })
     }
 
@@ -140,10 +147,12 @@ impl Parts {
             config: Arc::clone(config),
             queue: self.queue.clone(),
             store: self.store.clone(),
-            heartbeat: Heartbeat::start(&self.queue, config.database_file()?, Arc::clone(&owner))?,
+            heartbeat: Heartbeat::start(&self.queue, Arc::clone(&owner))?,
             owner,
+            memory: Memory::new(config.memory_mb, config.workers),
             shutdown: shutdown.clone(),
         });
+        tasks.spawn(Arc::clone(&worker).roll());
         for _ in 0..config.workers {
             tasks.spawn(Arc::clone(&worker).slot());
         }
@@ -166,37 +175,6 @@ fn lock(data_dir: &Path) -> anyhow::Result<File> {
         }
         Err(TryLockError::Error(error)) => Err(error).context("cannot lock the data folder"),
     }
-}
-
-/// Removes stored files that no job names: uploads that broke off before their commit, attempts that did not count,
-/// cancelled jobs. Only what is older than this start, so that nothing in flight is touched.
-async fn sweep(queue: Queue, store: Store, start: Uuid) {
-    let stored = match store.jobs().await {
-        Ok(jobs) => jobs,
-        Err(error) => return tracing::warn!(%error, "cannot sweep the store"),
-    };
-    for job in stored.into_iter().filter(|job| *job < start) {
-        let swept = match queue.is_known(job).await {
-            Ok(None | Some(JobState::Cancelled)) => store.erase_job(job).await,
-            Ok(Some(JobState::Succeeded)) => sweep_attempts(&queue, &store, job).await,
-            Ok(Some(_)) | Err(_) => Ok(()),
-        };
-        if let Err(error) = swept {
-            tracing::warn!(%job, %error, "cannot sweep");
-        }
-    }
-}
-
-/// Removes the files of attempts that the finished job does not name.
-async fn sweep_attempts(queue: &Queue, store: &Store, job: Uuid) -> Result<(), crate::store::Error> {
-    let Ok(named) = queue.artefacts(job).await else { return Ok(()) };
-    for fence in store.attempts(job).await? {
-        let prefix = format!("jobs/{job}/artefacts/{fence}/");
-        if !named.iter().any(|row| row.object_key.starts_with(&prefix)) {
-            store.erase_attempt(job, fence).await?;
-        }
-    }
-    Ok(())
 }
 
 /// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` on stdout, and at the
@@ -225,12 +203,14 @@ pub async fn work(config: Config) -> anyhow::Result<()> {
     if config.workers == 0 {
         bail!("a worker needs --workers 1 or more");
     }
+    crate::tls::provide();
     let config = Arc::new(config);
     std::fs::create_dir_all(&config.data_dir)?;
     let parts = Parts::open(&config).await?;
     let shutdown = CancellationToken::new();
     let mut tasks = JoinSet::new();
     let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+    tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
     say(&format!("working on {} jobs at a time", config.workers))?;
     stop_signal().await?;
     shutdown.cancel();
@@ -262,18 +242,15 @@ async fn stop_signal() -> std::io::Result<()> {
 /// The database cannot be opened, or holds a newer schema.
 pub async fn migrate(config: Config) -> anyhow::Result<()> {
     std::fs::create_dir_all(&config.data_dir)?;
-    Db::open(&config.database_file()?).await?.close().await;
+    Db::open(&config).await?.close().await;
     Ok(())
 }
 
-/// Make an admin key; it is stored as a digest and cannot be shown again.
+/// The database of a configuration, for the operator's own commands (keys, audit, backup).
 ///
 /// # Errors
-/// The database's; no random bytes.
-pub async fn create_key(config: Config, label: &str) -> anyhow::Result<String> {
+/// It cannot be opened, or holds a newer schema.
+pub async fn open_database(config: &Config) -> anyhow::Result<Db> {
     std::fs::create_dir_all(&config.data_dir)?;
-    let db = Db::open(&config.database_file()?).await?;
-    let key = auth::create_key(&db, label).await?;
-    db.close().await;
-    Ok(key)
+    Db::open(config).await
 }

@@ -1,6 +1,9 @@
 //! What every request handler shares.
 
+use crate::audit::{self, Entry};
+use crate::auth::Principal;
 use crate::config::Config;
+use crate::error::Problem;
 use crate::queue::Queue;
 use crate::store::Store;
 use crate::worker::Worker;
@@ -32,4 +35,22 @@ pub struct State {
     pub metrics: PrometheusHandle,
     /// The address really listened on.
     pub address: SocketAddr,
+}
+
+impl State {
+    /// Writes who did what into the audit; without the line, the caller must not go on.
+    ///
+    /// # Errors
+    /// The database's.
+    pub async fn audit(&self, who: &Principal, trace: &str, action: &str, object: &str) -> Result<(), Problem> {
+        let entry = Entry {
+            tenant: who.tenant.clone(),
+            actor: who.actor.clone(),
+            action: action.to_owned(),
+            object: object.to_owned(),
+            outcome: "ok".to_owned(),
+            trace_id: trace.to_owned(),
+        };
+        Ok(audit::write(self.queue.db(), entry).await?)
+    }
 }

@@ -15,6 +15,8 @@ pub(crate) enum What {
     Thinning,
     /// The remeshing of the benchmark anastomosis beside other programs on the same surface.
     Surface,
+    /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued.
+    Queue,
 }
 
 /// Thin the same volumes with our code, gaara and scikit-image, interleaved, and show medians and ratios.
@@ -25,7 +27,7 @@ pub(crate) fn thinning(repeat: usize) -> Result<()> {
     shell::run(build)?;
     let work = tools::target()?.join("bench-thinning");
     let mut bench = shell::command(tools::thinning_peers()?);
-    bench.arg(shell::root()?.join("tests/python/bench_thinning.py"));
+    bench.arg(shell::root()?.join("tests/bench/thinning.py"));
     bench.arg(tools::target()?.join("release/examples/thinning")).arg(&work).arg(repeat.to_string());
     shell::run(bench)
 }

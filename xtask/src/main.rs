@@ -4,6 +4,7 @@ mod bench;
 mod check;
 mod fuzz;
 mod shell;
+mod storm;
 mod survey;
 mod tools;
 
@@ -40,6 +41,18 @@ enum Command {
         #[arg(long, default_value_t = 1)]
         first: u64,
     },
+    /// Kill server, workers, children and the database at random while jobs come in; then look at every promise.
+    Storm {
+        /// Kills on each database.
+        #[arg(long, default_value_t = 1000)]
+        kills: usize,
+        /// Jobs on each database.
+        #[arg(long, default_value_t = 20_000)]
+        jobs: usize,
+        /// Seed of the order of kills.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+    },
     /// Change valid files and read them again: no reader may panic, hang or allocate beyond its limits.
     Fuzz {
         /// Minutes for each reader.
@@ -57,6 +70,9 @@ enum Command {
         /// Repetitions; the medians are shown.
         #[arg(long, default_value_t = 5)]
         repeat: usize,
+        /// Jobs queued in the large case of `queue`.
+        #[arg(long, default_value_t = 1_000_000)]
+        large: u64,
     },
 }
 
@@ -75,10 +91,12 @@ fn run(command: Command) -> Result<()> {
         Command::Demo { seed, keep } => demo(seed, keep),
         Command::Test => check::all(),
         Command::Survey { count, first } => survey::run(&tools::release_binary()?, first, count),
-        Command::Bench { what: bench::What::Whole, repeat } => bench::run(&tools::release_binary()?, repeat),
-        Command::Bench { what: bench::What::Thinning, repeat } => bench::thinning(repeat),
+        Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
+        Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
         Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
+        Command::Bench { what: bench::What::Queue, large, .. } => storm::bench(large),
+        Command::Storm { kills, jobs, seed } => storm::run(kills, jobs, seed),
     }
 }
 

@@ -78,6 +78,29 @@ pub(crate) fn node() -> Result<()> {
     Ok(())
 }
 
+/// A database server for the queue's tests; they run it themselves, in a temporary folder, as a user that is not root.
+pub(crate) fn postgres() -> Result<()> {
+    let servers = fs::read_dir("/usr/lib/postgresql").into_iter().flatten().flatten();
+    if servers.into_iter().any(|version| version.path().join("bin/initdb").exists()) {
+        return Ok(());
+    }
+    apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
+}
+
+/// An S3 server that checks signatures and checksums, for the store's tests; its program.
+pub(crate) fn s3() -> Result<PathBuf> {
+    let root = folder()?.join("s3s");
+    let program = root.join("bin/s3s-fs");
+    if !program.exists() {
+        let mut install = shell::command("cargo");
+        install
+            .args(["install", "s3s-fs", "--version", "0.14.1", "--features", "binary", "--locked", "--root"])
+            .arg(&root);
+        shell::run(install)?;
+    }
+    Ok(program)
+}
+
 /// Headless browser for the portal's test.
 pub(crate) fn browser() -> Result<()> {
     if shell::has("chromium") {

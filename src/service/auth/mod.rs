@@ -4,8 +4,11 @@
 //! hash). It comes as `Authorization: Bearer` or, for the portal's own page, as an HttpOnly SameSite=Strict cookie
 //! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
 
+pub mod keys;
+mod pace;
+
 use crate::config::Auth;
-use crate::db::{Db, now};
+use crate::db::{Db, Scope, args};
 use crate::error::Problem;
 use crate::state::State;
 use crate::store::hex;
@@ -23,8 +26,7 @@ pub const COOKIE: &str = "vasculum_key";
 pub const DEFAULT_TENANT: &str = "default";
 
 /// What a key may do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, sqlx::Type)]
-#[sqlx(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Send scans and read one's results.
     Upload,
@@ -43,14 +45,32 @@ pub enum Action {
     Read,
     /// Create, cancel, retry or erase jobs.
     Change,
+    /// Read the audit.
+    Audit,
 }
 
 impl Role {
+    /// The role of a word.
+    pub fn of(word: &str) -> Option<Self> {
+        [Self::Upload, Self::Read, Self::Admin, Self::Auditor].into_iter().find(|role| role.as_str() == word)
+    }
+
+    /// The word in the table and on the command line.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Upload => "upload",
+            Self::Read => "read",
+            Self::Admin => "admin",
+            Self::Auditor => "auditor",
+        }
+    }
+
     /// Whether this role may do that.
     pub fn may(self, action: Action) -> bool {
         match action {
             Action::Read => self != Self::Auditor,
             Action::Change => matches!(self, Self::Upload | Self::Admin),
+            Action::Audit => matches!(self, Self::Auditor | Self::Admin),
         }
     }
 }
@@ -62,6 +82,10 @@ pub struct Principal {
     pub tenant: String,
     /// What may be done.
     pub role: Role,
+    /// Which key: its id, for the audit. `open` for a service without keys.
+    pub actor: String,
+    /// Largest upload of this key, bytes.
+    pub max_bytes: Option<u64>,
 }
 
 /// A new random key.
@@ -80,38 +104,11 @@ pub fn new_key() -> Result<String, getrandom::Error> {
 /// The database's; no random bytes.
 pub async fn first_key(db: &Db) -> anyhow::Result<Option<String>> {
     let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
-    let made = sqlx::query(concat!(
-        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) SELECT $1, $2, 'admin', 'first start', $3, ",
-        now!(),
-        " WHERE NOT EXISTS (SELECT 1 FROM api_key WHERE revoked_at IS NULL)"
-    ))
-    .bind(Uuid::now_v7().to_string())
-    .bind(DEFAULT_TENANT)
-    .bind(digest(&key))
-    .execute(&db.writer)
-    .await?
-    .rows_affected();
+    let sql = "INSERT INTO api_key (id, tenant, role, label, digest, created_at) \
+               SELECT $1, $2, 'admin', 'first start', $3, now_ms() \
+               WHERE NOT EXISTS (SELECT 1 FROM api_key WHERE revoked_at IS NULL)";
+    let made = db.run(Scope::System, sql, args![Uuid::now_v7(), DEFAULT_TENANT, digest(&key)]).await?;
     Ok((made > 0).then_some(key))
-}
-
-/// Makes another admin key and returns it.
-///
-/// # Errors
-/// The database's; no random bytes.
-pub async fn create_key(db: &Db, label: &str) -> anyhow::Result<String> {
-    let key = new_key().map_err(|e| anyhow::anyhow!("no random bytes for a key: {e}"))?;
-    sqlx::query(concat!(
-        "INSERT INTO api_key (id, tenant, role, label, digest, created_at) VALUES ($1, $2, 'admin', $3, $4, ",
-        now!(),
-        ")"
-    ))
-    .bind(Uuid::now_v7().to_string())
-    .bind(DEFAULT_TENANT)
-    .bind(label)
-    .bind(digest(&key))
-    .execute(&db.writer)
-    .await?;
-    Ok(key)
 }
 
 fn digest(key: &str) -> Vec<u8> {
@@ -123,15 +120,19 @@ fn digest(key: &str) -> Vec<u8> {
 /// # Errors
 /// `auth.key` when the key is unknown or revoked; the database's.
 pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
-    let row: Option<(String, Role)> =
-        sqlx::query_as("SELECT tenant, role FROM api_key WHERE digest = $1 AND revoked_at IS NULL")
-            .bind(digest(key))
-            .fetch_optional(&db.reader)
-            .await?;
-    match row {
-        Some((tenant, role)) => Ok(Principal { tenant, role }),
-        None => Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one.")),
+    let sql =
+        "SELECT id, tenant, role, max_bytes, requests_per_minute FROM api_key WHERE digest = $1 AND revoked_at IS NULL";
+    let row = db.row(Scope::System, sql, args![digest(key)]).await?;
+    let Some(row) = row else {
+        return Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one."));
+    };
+    let role = Role::of(row.get("role")?).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
+    let max_bytes = row.get::<Option<i64>>("max_bytes")?.and_then(|n| u64::try_from(n).ok());
+    let id: String = row.get("id")?;
+    if let Some(most) = row.get::<Option<i64>>("requests_per_minute")? {
+        pace::count(&id, most)?;
     }
+    Ok(Principal { tenant: row.get("tenant")?, role, actor: id, max_bytes })
 }
 
 fn unauthorized(code: &str, detail: &str) -> Problem {
@@ -168,35 +169,58 @@ fn same_origin(headers: &HeaderMap) -> bool {
     }
 }
 
+/// A caller who is known, before it is known what for: a handler says what it wants by [`Caller::may`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Caller(Principal);
+
+impl Caller {
+    /// The principal, if its role may do that.
+    ///
+    /// # Errors
+    /// `auth.role`.
+    pub fn may(self, action: Action) -> Result<Principal, Problem> {
+        if self.0.role.may(action) {
+            Ok(self.0)
+        } else {
+            Err(Problem::new(StatusCode::FORBIDDEN, "auth.role", "This API key may not do that. Ask the operator."))
+        }
+    }
+}
+
+impl FromRequestParts<State> for Caller {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &State) -> Result<Self, Problem> {
+        let safe = parts.method.is_safe();
+        if state.config.auth == Auth::None {
+            return Ok(Self(Principal {
+                tenant: DEFAULT_TENANT.to_owned(),
+                role: Role::Admin,
+                actor: "open".to_owned(),
+                max_bytes: None,
+            }));
+        }
+        match sent(&parts.headers) {
+            None => Err(unauthorized(
+                "auth.missing",
+                "This call needs an API key: send the header Authorization: Bearer vsk_...",
+            )),
+            Some(Sent::Cookie(_)) if !safe && !same_origin(&parts.headers) => Err(Problem::new(
+                StatusCode::FORBIDDEN,
+                "auth.origin",
+                "A page of another origin may not change anything here by cookie.",
+            )),
+            Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
+        }
+    }
+}
+
 impl FromRequestParts<State> for Principal {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, state: &State) -> Result<Self, Problem> {
         let action = if parts.method.is_safe() { Action::Read } else { Action::Change };
-        let principal = match state.config.auth {
-            Auth::None => Self { tenant: DEFAULT_TENANT.to_owned(), role: Role::Admin },
-            Auth::Required => match sent(&parts.headers) {
-                None => {
-                    return Err(unauthorized(
-                        "auth.missing",
-                        "This call needs an API key: send the header Authorization: Bearer vsk_...",
-                    ));
-                }
-                Some(Sent::Cookie(_)) if action == Action::Change && !same_origin(&parts.headers) => {
-                    return Err(Problem::new(
-                        StatusCode::FORBIDDEN,
-                        "auth.origin",
-                        "A page of another origin may not change anything here by cookie.",
-                    ));
-                }
-                Some(Sent::Bearer(key) | Sent::Cookie(key)) => principal(state.queue.db(), key).await?,
-            },
-        };
-        if principal.role.may(action) {
-            Ok(principal)
-        } else {
-            Err(Problem::new(StatusCode::FORBIDDEN, "auth.role", "This API key may not do that. Ask the operator."))
-        }
+        Caller::from_request_parts(parts, state).await?.may(action)
     }
 }
 

@@ -1,16 +1,17 @@
 //! What a job made: the list, each file with ranges and entity tags, and the result in the form that is asked for.
 
 use super::jobs::job_of;
+use super::problems::TraceId;
 use super::range::{self, Asked};
 use super::shapes::{Artefact, ArtefactList};
 use crate::auth::Principal;
 use crate::error::Problem;
-use crate::media::{self, FORMS, Form};
+use crate::media::{self, FORMS, Form, base64};
 use crate::queue::{ArtefactRow, JobRow, JobState};
 use crate::state::State;
 use axum::Json;
 use axum::body::Body;
-use axum::extract::{Path, Query, State as Shared};
+use axum::extract::{Extension, Path, Query, State as Shared};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use serde::Deserialize;
@@ -54,11 +55,13 @@ async fn list(
 async fn artefact(
     Shared(state): Shared<State>,
     who: Principal,
+    Extension(trace): Extension<TraceId>,
     Path((id, name)): Path<(String, String)>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let (id, _) = job_of(&state, &who, &id).await?;
     let row = state.queue.artefact(id, &name).await?.ok_or_else(|| Problem::not_found("artefact"))?;
+    state.audit(&who, &trace.0, "artefact.read", &format!("{id}/{name}")).await?;
     send(&state, &row, &headers).await
 }
 
@@ -84,6 +87,7 @@ struct Wanted {
 async fn result(
     Shared(state): Shared<State>,
     who: Principal,
+    Extension(trace): Extension<TraceId>,
     Path(id): Path<String>,
     Query(wanted): Query<Wanted>,
     headers: HeaderMap,
@@ -100,6 +104,7 @@ async fn result(
     }
     let row = state.queue.artefact(id, form.artefact).await?;
     let row = row.ok_or_else(|| Problem::not_found(&format!("artefact {}", form.artefact)))?;
+    state.audit(&who, &trace.0, "artefact.read", &format!("{id}/{}", row.name)).await?;
     let mut response = send(&state, &row, &headers).await?;
     response.headers_mut().insert(header::VARY, HeaderValue::from_static("accept"));
     Ok(response)
@@ -172,8 +177,13 @@ async fn body(
     status: StatusCode,
 ) -> Result<Response, Problem> {
     let length = part.end - part.start;
-    let stream = state.store.stream(&row.object_key, part).await?;
-    let mut response = (status, Body::from_stream(stream)).into_response();
+    // A whole file is checked against its digest while it is sent; a part cannot be.
+    let body = if u64::try_from(row.bytes).is_ok_and(|size| length == size && size > 0) {
+        Body::from_stream(state.store.whole(&row.object_key, &row.digest).await?)
+    } else {
+        Body::from_stream(state.store.stream(&row.object_key, part).await?)
+    };
+    let mut response = (status, body).into_response();
     insert(&mut response, header::CONTENT_TYPE, &row.media_type);
     insert(&mut response, header::CONTENT_LENGTH, &length.to_string());
     insert(&mut response, header::CONTENT_DISPOSITION, &format!("inline; filename=\"{}\"", row.name));
@@ -201,29 +211,9 @@ fn report_policy(html: &[u8]) -> String {
     format!("default-src 'none'; img-src data:; style-src{styles}; frame-ancestors 'none'; sandbox")
 }
 
-fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::new();
-    for three in bytes.chunks(3) {
-        let bits = three.iter().enumerate().fold(0_u32, |bits, (i, byte)| bits | u32::from(*byte) << (16 - 8 * i));
-        for i in 0..4 {
-            let digit = DIGITS[((bits >> (18 - 6 * i)) & 63) as usize];
-            text.push(if i <= three.len() { char::from(digit) } else { '=' });
-        }
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn base64_as_rfc_4648_has_it() {
-        for (plain, coded) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg==")] {
-            assert_eq!(base64(plain.as_bytes()), coded);
-        }
-    }
 
     #[test]
     fn a_report_may_use_its_own_style_and_nothing_else() {

@@ -1,5 +1,6 @@
 //! Is it alive, is it ready, what is it: calls without a key, for monitors.
 
+use crate::db::Scope;
 use crate::error::Problem;
 use crate::state::State;
 use crate::telemetry;
@@ -50,9 +51,9 @@ struct Ready {
 ))]
 async fn readyz(Shared(state): Shared<State>) -> Result<Json<Ready>, Problem> {
     let database = async {
-        sqlx::query("SELECT 1 FROM tenant LIMIT 1").execute(&state.queue.db().reader).await?;
-        // Takes and gives back the write lock: a full disk or a read-only file shows here.
-        sqlx::query("DELETE FROM tenant WHERE id = ''").execute(&state.queue.db().writer).await
+        // Takes and gives back a write: a full disk or a read-only file shows here, and the readers answer too.
+        state.queue.db().run(Scope::System, "DELETE FROM tenant WHERE id = ''", Vec::new()).await?;
+        state.queue.db().row(Scope::System, "SELECT id FROM tenant LIMIT 1", Vec::new()).await
     };
     let database = tokio::time::timeout(PATIENCE, database).await;
     let store = tokio::time::timeout(PATIENCE, state.store.probe()).await;

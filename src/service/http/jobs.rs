@@ -7,6 +7,7 @@ use super::shapes::{Job, JobList};
 use crate::auth::Principal;
 use crate::error::Problem;
 use crate::intake::intake;
+use crate::queue::submit::LARGEST_PRIORITY;
 use crate::queue::{JobRow, JobState, NewJob, Page, Submitted};
 use crate::state::State;
 use crate::store::Store;
@@ -42,6 +43,7 @@ pub(super) fn router() -> OpenApiRouter<State> {
         .routes(routes!(list))
         .routes(routes!(read, erase))
         .routes(routes!(cancel))
+        .routes(routes!(cancel_all))
         .routes(routes!(retry))
 }
 
@@ -69,16 +71,37 @@ struct SubmitForm {
     input: Vec<Vec<u8>>,
 }
 
+/// How to take the upload.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct Taking {
+    /// `true`: read and check only; nothing is stored and no job is made.
+    validate: Option<bool>,
+    /// -100 to 100; one step is worth a minute of waiting. 0 without.
+    #[param(minimum = -100, maximum = 100)]
+    priority: Option<i64>,
+}
+
+/// What a check of an upload found.
+#[derive(Debug, serde::Serialize, utoipa::ToSchema)]
+struct Checked {
+    /// Always true: faults are a problem.
+    valid: bool,
+    /// What would be stored.
+    input: super::shapes::InputShape,
+}
+
 /// Sends a scan and makes a job. A 202 is given once the job is durable.
 #[utoipa::path(post, path = "/v1/jobs", operation_id = "create_job", tag = "jobs", security(("key" = [])),
-    params(
+    params(Taking,
         ("Idempotency-Key" = Option<String>, Header, description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
     ),
     request_body(content = SubmitForm, content_type = "multipart/form-data"),
     responses(
         (status = 202, description = "Accepted", body = Job),
-        (status = 200, description = "Ended within the wait, or the key was used before", body = Job),
+        (status = 200, description = "Ended within the wait, or the key was used before; with `validate`, what was read", body = Job),
         (status = 400, description = "The upload is broken", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "A limit was met", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "Not multipart/form-data, or files that cannot be read", body = Problem, content_type = "application/problem+json"),
@@ -89,10 +112,16 @@ async fn create(
     Shared(state): Shared<State>,
     who: Principal,
     Extension(trace): Extension<TraceId>,
+    Query(taking): Query<Taking>,
     request: Request,
 ) -> Result<Response, Problem> {
+    let priority = taking.priority.unwrap_or(0);
+    if priority.abs() > LARGEST_PRIORITY {
+        let detail = format!("The priority must be {} to {LARGEST_PRIORITY}.", -LARGEST_PRIORITY);
+        return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
+    }
     let headers = request.headers().clone();
-    let form = form(&state, request).await?;
+    let form = form(&state, &who, request).await?;
     let key = idempotency_key(&headers)?;
     let upload = multipart::read(&state, form).await?;
     let files = intake(&state.config, upload.files).await?;
@@ -100,14 +129,22 @@ async fn create(
         tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
     let id = Uuid::now_v7();
     let bytes: u64 = input.files.iter().map(|f| f.bytes).sum();
+    if taking.validate == Some(true) {
+        let files = i64::try_from(input.files.len()).map_err(Problem::internal)?;
+        let bytes = i64::try_from(bytes).map_err(Problem::internal)?;
+        let input = super::shapes::InputShape { files, bytes, digest: input.digest };
+        return Ok(Json(Checked { valid: true, input }).into_response());
+    }
     let job = NewJob {
         id,
         tenant: who.tenant.clone(),
+        priority,
+        memory_mb: crate::worker::expected_mb(bytes),
         plan: upload.plan,
         input_digest: input.digest.clone(),
         input_files: i64::try_from(input.files.len()).map_err(Problem::internal)?,
         input_bytes: i64::try_from(bytes).map_err(Problem::internal)?,
-        trace_id: trace.0,
+        trace_id: trace.0.clone(),
         idempotency_key: key,
     };
     let submitted = store_and_submit(&state, &job, &input, files).await;
@@ -123,20 +160,27 @@ async fn create(
             ));
         }
     };
+    if !replayed {
+        state.audit(&who, &trace.0, "job.create", &row.id).await?;
+    }
     let waited = preferred_wait(&headers);
     let row = wait(&state, &who, row, waited, |row| row.state.is_final()).await?;
     Ok(accepted(row, waited, replayed))
 }
 
 /// The multipart body; a Content-Length beyond the limit is refused before a byte is read.
-async fn form(state: &State, request: Request) -> Result<Multipart, Problem> {
+async fn form(state: &State, who: &Principal, request: Request) -> Result<Multipart, Problem> {
     let length = request.headers().get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<u64>().ok());
     // Boundaries and part headers come on top of the parts' bytes.
-    if length.is_some_and(|n| n > state.config.max_body.saturating_add(1 << 20)) {
+    let most = who.max_bytes.unwrap_or(u64::MAX).min(state.config.max_body);
+    // A key with a bound of its own must say how much it sends: what is not counted beforehand would be read in vain.
+    if length.is_some_and(|n| n > most.saturating_add(1 << 20)) || (length.is_none() && who.max_bytes.is_some()) {
         return Err(Problem::new(
             StatusCode::PAYLOAD_TOO_LARGE,
             "upload.too_large",
-            format!("The upload is larger than {} bytes, the most that this service takes.", state.config.max_body),
+            format!(
+                "The upload is larger than {most} bytes (or does not say its length), the most that this key may send."
+            ),
         ));
     }
     Multipart::from_request(request, state).await.map_err(|_| {
@@ -330,9 +374,15 @@ fn tag(row: &JobRow) -> String {
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "It has ended already", body = Problem, content_type = "application/problem+json")
     ))]
-async fn cancel(Shared(state): Shared<State>, who: Principal, Path(id): Path<String>) -> Result<Response, Problem> {
+async fn cancel(
+    Shared(state): Shared<State>,
+    who: Principal,
+    Extension(trace): Extension<TraceId>,
+    Path(id): Path<String>,
+) -> Result<Response, Problem> {
     let id = job_id(&id)?;
     let row = state.queue.cancel(&who.tenant, id).await?.ok_or_else(|| Problem::not_found("job"))?;
+    state.audit(&who, &trace.0, "job.cancel", &id.to_string()).await?;
     match row.state {
         JobState::Cancelled => {
             state.store.erase_job(id).await?;
@@ -347,6 +397,54 @@ async fn cancel(Shared(state): Shared<State>, who: Principal, Path(id): Path<Str
     }
 }
 
+/// Which jobs to cancel.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct Filter {
+    /// `queued` or `running`; both without.
+    state: Option<JobState>,
+    /// Only jobs created before this time (RFC 3339).
+    created_before: Option<String>,
+}
+
+/// What a bulk cancel did.
+#[derive(Debug, serde::Serialize, utoipa::ToSchema)]
+struct CancelledAll {
+    /// Jobs that are cancelled or whose workers were told.
+    cancelled: usize,
+}
+
+/// Cancels every job that the filter names.
+#[utoipa::path(post, path = "/v1/jobs/cancel", operation_id = "cancel_jobs", tag = "jobs", security(("key" = [])),
+    params(Filter), responses(
+        (status = 200, description = "Cancelled, or told their workers", body = CancelledAll),
+        (status = 400, description = "The filter cannot be understood", body = Problem, content_type = "application/problem+json")
+    ))]
+async fn cancel_all(
+    Shared(state): Shared<State>,
+    who: Principal,
+    Extension(trace): Extension<TraceId>,
+    Query(filter): Query<Filter>,
+) -> Result<Json<CancelledAll>, Problem> {
+    let before = match &filter.created_before {
+        None => None,
+        Some(text) => Some(crate::media::ms_of(text).ok_or_else(|| {
+            let detail = "created_before must be a time of RFC 3339 such as 2026-11-24T20:00:00Z.";
+            Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail)
+        })?),
+    };
+    let ids = state.queue.cancel_all(&who.tenant, filter.state, before).await?;
+    for id in &ids {
+        state.audit(&who, &trace.0, "job.cancel", &id.to_string()).await?;
+        // A running one is erased by its worker.
+        if state.queue.is_known(*id).await? == Some(JobState::Cancelled) {
+            state.store.erase_job(*id).await?;
+        }
+    }
+    Ok(Json(CancelledAll { cancelled: ids.len() }))
+}
+
 /// Puts a failed job back into the queue with all its attempts.
 #[utoipa::path(post, path = "/v1/jobs/{id}/retry", operation_id = "retry_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job")), responses(
@@ -354,10 +452,18 @@ async fn cancel(Shared(state): Shared<State>, who: Principal, Path(id): Path<Str
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "It has not failed", body = Problem, content_type = "application/problem+json")
     ))]
-async fn retry(Shared(state): Shared<State>, who: Principal, Path(id): Path<String>) -> Result<Response, Problem> {
+async fn retry(
+    Shared(state): Shared<State>,
+    who: Principal,
+    Extension(trace): Extension<TraceId>,
+    Path(id): Path<String>,
+) -> Result<Response, Problem> {
     let (id, row) = job_of(&state, &who, &id).await?;
     match state.queue.retry(&who.tenant, id).await? {
-        Some(row) => Ok((StatusCode::ACCEPTED, Json(Job::from(row))).into_response()),
+        Some(row) => {
+            state.audit(&who, &trace.0, "job.retry", &row.id).await?;
+            Ok((StatusCode::ACCEPTED, Json(Job::from(row))).into_response())
+        }
         None => Err(Problem::new(
             StatusCode::CONFLICT,
             "job.not_failed",
@@ -375,13 +481,20 @@ async fn retry(Shared(state): Shared<State>, who: Principal, Path(id): Path<Stri
         (status = 204, description = "Erased"),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json")
     ))]
-async fn erase(Shared(state): Shared<State>, who: Principal, Path(id): Path<String>) -> Result<StatusCode, Problem> {
+async fn erase(
+    Shared(state): Shared<State>,
+    who: Principal,
+    Extension(trace): Extension<TraceId>,
+    Path(id): Path<String>,
+) -> Result<StatusCode, Problem> {
     let (id, row) = job_of(&state, &who, &id).await?;
     if !row.state.is_final() {
         let row = state.queue.cancel(&who.tenant, id).await?.ok_or_else(|| Problem::not_found("job"))?;
         // A worker that does not answer loses its lease with the row and drops its files by itself.
         wait(&state, &who, row, Some(ERASE_WAIT), |row| row.state.is_final()).await?;
     }
+    // The tombstone comes first: an erasure that nobody can account for must not happen.
+    state.audit(&who, &trace.0, "job.erase", &id.to_string()).await?;
     state.queue.erase(&who.tenant, id).await?;
     state.store.erase_job(id).await?;
     Ok(StatusCode::NO_CONTENT)

@@ -12,6 +12,8 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod webhooks;
+mod workers;
 
 use crate::state::State;
 use axum::Router;
@@ -39,6 +41,7 @@ const SMALL_BODY: usize = 64 << 10;
     tags(
         (name = "jobs", description = "Send a scan, follow it, end it"),
         (name = "results", description = "What a job made"),
+        (name = "webhooks", description = "Be told when a job ends"),
         (name = "monitoring", description = "Is it well, and how busy is it")
     )
 )]
@@ -62,6 +65,8 @@ fn documented() -> OpenApiRouter<State> {
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
+        .merge(workers::router())
+        .merge(webhooks::router())
         .merge(session::router())
         .merge(health::router())
 }

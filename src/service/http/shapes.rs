@@ -1,10 +1,9 @@
 //! The JSON shapes of contract.md.
 
 use crate::error::Problem;
+use crate::media::rfc3339;
 use crate::queue::{ArtefactRow, EventRow, JobRow, JobState};
 use serde::Serialize;
-use time::OffsetDateTime;
-use time::format_description::well_known::Rfc3339;
 use utoipa::ToSchema;
 
 /// Addresses that belong to a job.
@@ -138,11 +137,6 @@ pub(super) struct EventList {
     pub items: Vec<EventShape>,
     /// Address of the next page, or null.
     pub next: Option<String>,
-}
-
-/// RFC 3339 of ms since 1970; `None` beyond the calendar.
-fn rfc3339(ms: i64) -> Option<String> {
-    OffsetDateTime::from_unix_timestamp_nanos(i128::from(ms) * 1_000_000).ok()?.format(&Rfc3339).ok()
 }
 
 impl From<JobRow> for Job {

@@ -6,46 +6,56 @@
 //! seen event N has seen everything before it. Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
-//! `submit` and `read` serve the API, `claim` and `finish` the workers.
+//! `submit` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
 
 mod claim;
 mod finish;
+mod keep;
 mod read;
-mod submit;
+pub(crate) mod submit;
 mod types;
 
-pub use claim::{Beat, Claim, Verdict};
+pub use claim::{Beat, Claim, Room, Verdict};
 pub use finish::{Closing, Published};
+pub use keep::WorkerRow;
 pub use read::{Counts, Page};
 pub use submit::{NewJob, Submitted};
 pub use types::{ArtefactRow, EventRow, JobRow, JobState};
 
 use crate::db::Db;
-use tokio::sync::broadcast;
+use tokio::sync::{broadcast, mpsc};
+use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-/// How long a claim holds without a beat, ms (service.md: a dead worker's job runs again within 15 s).
-pub const LEASE_MS: i64 = 15_000;
+/// How long a claim holds without a beat, ms. With the rescue's period of 2 s a dead worker's job runs again within 15 s.
+pub const LEASE_MS: i64 = 12_000;
+/// One step of priority is worth so much waiting, ms: a job of priority 0 passes a newer one of priority 10 after 10 min.
+pub const AGEING_MS: i64 = 60_000;
 /// Job ids buffered for a slow listener; one that lags reads the table anyway.
 const HINTS: usize = 1024;
+/// Hints to other processes go out together, this often at most.
+const TELL: std::time::Duration = std::time::Duration::from_millis(10);
+/// Between attempts to listen again.
+const RELISTEN: std::time::Duration = std::time::Duration::from_secs(2);
 
-/// The queue: the table plus an in-process hint that a job changed. The table is the truth, the hint saves waiting.
+/// The queue: the table plus a hint that a job changed. The table is the truth, the hint saves waiting.
 #[derive(Clone, Debug)]
 pub struct Queue {
     db: Db,
     hints: broadcast::Sender<Uuid>,
+    told: broadcast::Sender<Uuid>,
 }
 
 impl Queue {
     /// A queue over an open database.
     pub fn new(db: Db) -> Self {
-        Self { db, hints: broadcast::Sender::new(HINTS) }
+        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS) }
     }
 
     /// The same table and hints through another connection (the heartbeat thread has its own).
     #[must_use]
     pub fn with_db(&self, db: Db) -> Self {
-        Self { db, hints: self.hints.clone() }
+        Self { db, hints: self.hints.clone(), told: self.told.clone() }
     }
 
     /// The database under it.
@@ -58,9 +68,62 @@ impl Queue {
         self.hints.subscribe()
     }
 
-    /// Tells the listeners of this process that a job changed.
+    /// Tells the listeners of this process that a job changed, and soon those of the others.
     pub(crate) fn hint(&self, id: Uuid) {
         // An error only means that nobody listens.
         let _ = self.hints.send(id);
+        let _ = self.told.send(id);
+    }
+
+    /// Carries hints to and from other processes until the end. Hints may be lost; nothing depends on one.
+    pub async fn carry_hints(self, shutdown: CancellationToken) {
+        let tell = self.clone().tell();
+        let hear = self.hear();
+        tokio::select! {
+            () = shutdown.cancelled() => {}
+            () = async { tokio::join!(tell, hear); } => {}
+        }
+    }
+
+    async fn tell(self) {
+        let mut told = self.told.subscribe();
+        loop {
+            match told.recv().await {
+                Ok(id) => {
+                    tokio::time::sleep(TELL).await;
+                    let mut ids = vec![id];
+                    while let Ok(more) = told.try_recv() {
+                        ids.push(more);
+                    }
+                    ids.sort_unstable();
+                    ids.dedup();
+                    if let Err(error) = self.db.tell(&ids).await {
+                        tracing::debug!(%error, "hint not sent");
+                    }
+                }
+                Err(broadcast::error::RecvError::Lagged(_)) => {}
+                Err(broadcast::error::RecvError::Closed) => return,
+            }
+        }
+    }
+
+    async fn hear(&self) {
+        let (sender, mut heard) = mpsc::unbounded_channel();
+        let listen = async {
+            loop {
+                match self.db.listen(sender.clone()).await {
+                    Ok(()) => std::future::pending::<()>().await,
+                    Err(error) => tracing::warn!(%error, "not listening for hints; the table is polled"),
+                }
+                tokio::time::sleep(RELISTEN).await;
+            }
+        };
+        let pass = async {
+            while let Some(id) = heard.recv().await {
+                // An error only means that nobody listens.
+                let _ = self.hints.send(id);
+            }
+        };
+        tokio::join!(listen, pass);
     }
 }

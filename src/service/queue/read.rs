@@ -1,8 +1,7 @@
-//! Reading: one job, pages of jobs, events, artefacts, counts. Every read names the tenant.
+//! Reading: one job, pages of jobs, events, artefacts, counts. Every read of a request names the tenant.
 
 use super::{ArtefactRow, EventRow, JobRow, JobState, Queue};
-use crate::db::now;
-use sqlx::FromRow;
+use crate::db::{Scope, args};
 use uuid::Uuid;
 
 /// Which jobs to list, newest first.
@@ -17,7 +16,7 @@ pub struct Page {
 }
 
 /// How many jobs stand where.
-#[derive(Clone, Copy, Debug, Default, PartialEq, FromRow)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Counts {
     /// Waiting.
     pub queued: i64,
@@ -39,11 +38,11 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn job(&self, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
-        sqlx::query_as("SELECT * FROM job WHERE id = $1 AND tenant = $2")
-            .bind(id.to_string())
-            .bind(tenant)
-            .fetch_optional(&self.db().reader)
-            .await
+        let row = self
+            .db()
+            .row(Scope::Tenant(tenant), "SELECT * FROM job WHERE id = $1 AND tenant = $2", args![id, tenant])
+            .await?;
+        row.as_ref().map(JobRow::of).transpose()
     }
 
     /// A page of jobs, newest first, by key and never by offset.
@@ -53,57 +52,43 @@ impl Queue {
     pub async fn jobs(&self, tenant: &str, page: &Page) -> sqlx::Result<Vec<JobRow>> {
         // Every id sorts below 'g': UUIDs are hexadecimal.
         let before = page.before.map_or_else(|| "g".to_owned(), |id| id.to_string());
-        let query = match page.state {
-            None => sqlx::query_as("SELECT * FROM job WHERE tenant = $1 AND id < $2 ORDER BY id DESC LIMIT $3"),
-            Some(_) => sqlx::query_as(
-                "SELECT * FROM job WHERE tenant = $1 AND id < $2 AND state = $4 ORDER BY id DESC LIMIT $3",
-            ),
+        let mut values = args![tenant, before, page.limit];
+        let sql = match page.state {
+            None => "SELECT * FROM job WHERE tenant = $1 AND id < $2 ORDER BY id DESC LIMIT $3",
+            Some(state) => {
+                values.extend(args![state.as_str()]);
+                "SELECT * FROM job WHERE tenant = $1 AND id < $2 AND state = $4 ORDER BY id DESC LIMIT $3"
+            }
         };
-        let query = query.bind(tenant).bind(before).bind(page.limit);
-        match page.state {
-            None => query,
-            Some(state) => query.bind(state),
-        }
-        .fetch_all(&self.db().reader)
-        .await
+        self.db().rows(Scope::Tenant(tenant), sql, values).await?.iter().map(JobRow::of).collect()
     }
 
-    /// Events of a job after the event `after`, oldest first.
+    /// Events of a job after the event `after`, oldest first. The caller has found the job under its tenant.
     ///
     /// # Errors
     /// The database's.
     pub async fn events(&self, id: Uuid, after: i64, limit: i64) -> sqlx::Result<Vec<EventRow>> {
-        sqlx::query_as(
-            "SELECT id, kind, state, stage, progress, eta_s, at FROM event WHERE job = $1 AND id > $2 ORDER BY id LIMIT $3",
-        )
-        .bind(id.to_string())
-        .bind(after)
-        .bind(limit)
-        .fetch_all(&self.db().reader)
-        .await
+        let sql = "SELECT id, kind, state, stage, progress, eta_s, at FROM event \
+                   WHERE job = $1 AND id > $2 ORDER BY id LIMIT $3";
+        self.db().rows(Scope::System, sql, args![id, after, limit]).await?.iter().map(EventRow::of).collect()
     }
 
-    /// The artefacts of a job, by name.
+    /// The artefacts of a job, by name. The caller has found the job under its tenant.
     ///
     /// # Errors
     /// The database's.
     pub async fn artefacts(&self, id: Uuid) -> sqlx::Result<Vec<ArtefactRow>> {
-        sqlx::query_as("SELECT name, media_type, bytes, digest, object_key FROM artefact WHERE job = $1 ORDER BY name")
-            .bind(id.to_string())
-            .fetch_all(&self.db().reader)
-            .await
+        let sql = "SELECT name, media_type, bytes, digest, object_key FROM artefact WHERE job = $1 ORDER BY name";
+        self.db().rows(Scope::System, sql, args![id]).await?.iter().map(ArtefactRow::of).collect()
     }
 
-    /// One artefact of a job.
+    /// One artefact of a job. The caller has found the job under its tenant.
     ///
     /// # Errors
     /// The database's.
     pub async fn artefact(&self, id: Uuid, name: &str) -> sqlx::Result<Option<ArtefactRow>> {
-        sqlx::query_as("SELECT name, media_type, bytes, digest, object_key FROM artefact WHERE job = $1 AND name = $2")
-            .bind(id.to_string())
-            .bind(name)
-            .fetch_optional(&self.db().reader)
-            .await
+        let sql = "SELECT name, media_type, bytes, digest, object_key FROM artefact WHERE job = $1 AND name = $2";
+        self.db().row(Scope::System, sql, args![id, name]).await?.as_ref().map(ArtefactRow::of).transpose()
     }
 
     /// Counts per state of one tenant, or of all with `None`.
@@ -111,19 +96,37 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn counts(&self, tenant: Option<&str>) -> sqlx::Result<Counts> {
-        sqlx::query_as(concat!(
-            "SELECT COUNT(*) FILTER (WHERE state = 'queued') AS queued, ",
-            "COUNT(*) FILTER (WHERE state = 'running') AS running, ",
-            "COUNT(*) FILTER (WHERE state = 'succeeded') AS succeeded, ",
-            "COUNT(*) FILTER (WHERE state = 'failed') AS failed, ",
-            "COUNT(*) FILTER (WHERE state = 'cancelled') AS cancelled, ",
-            "COALESCE(",
-            now!(),
-            " - MIN(created_at) FILTER (WHERE state = 'queued'), 0) AS oldest_queued_ms ",
-            "FROM job WHERE $1 IS NULL OR tenant = $1"
-        ))
-        .bind(tenant)
-        .fetch_one(&self.db().reader)
-        .await
+        const COUNTS: &str = "SELECT state, COUNT(*) AS jobs, \
+             CAST(COALESCE(now_ms() - MIN(created_at), 0) AS BIGINT) AS age_ms FROM job GROUP BY state";
+        const OF_TENANT: &str = "SELECT state, COUNT(*) AS jobs, \
+             CAST(COALESCE(now_ms() - MIN(created_at), 0) AS BIGINT) AS age_ms FROM job WHERE tenant = $1 GROUP BY state";
+        let rows = match tenant {
+            None => self.db().rows(Scope::System, COUNTS, Vec::new()).await?,
+            Some(tenant) => self.db().rows(Scope::Tenant(tenant), OF_TENANT, args![tenant]).await?,
+        };
+        let mut counts = Counts::default();
+        for row in &rows {
+            let jobs = row.get("jobs")?;
+            match JobState::of(row.get("state")?)? {
+                JobState::Queued => {
+                    counts.queued = jobs;
+                    counts.oldest_queued_ms = row.get("age_ms")?;
+                }
+                JobState::Running => counts.running = jobs,
+                JobState::Succeeded => counts.succeeded = jobs,
+                JobState::Failed => counts.failed = jobs,
+                JobState::Cancelled => counts.cancelled = jobs,
+            }
+        }
+        Ok(counts)
+    }
+
+    /// Where a job stands, whoever owns it; `None` when there is none.
+    ///
+    /// # Errors
+    /// The database's.
+    pub async fn is_known(&self, id: Uuid) -> sqlx::Result<Option<JobState>> {
+        let row = self.db().row(Scope::System, "SELECT state FROM job WHERE id = $1", args![id]).await?;
+        row.map(|row| JobState::of(row.get("state")?)).transpose()
     }
 }

@@ -1,9 +1,14 @@
 //! Accepting, cancelling, retrying and erasing: the writes of the API.
 
-use super::{JobRow, JobState, Queue};
-use crate::db::now;
-use sqlx::{Sqlite, Transaction};
+use super::finish::settle;
+use super::{AGEING_MS, JobRow, JobState, Queue};
+use crate::db::{Scope, Tx, args};
 use uuid::Uuid;
+
+/// Jobs that one bulk cancel takes in one transaction; the rest follows in the next.
+const BULK: i64 = 500;
+/// Priorities beyond this would let a job pass whole days of others.
+pub(crate) const LARGEST_PRIORITY: i64 = 100;
 
 /// A job to accept; its input is in the store already.
 #[derive(Clone, Debug)]
@@ -12,6 +17,8 @@ pub struct NewJob {
     pub id: Uuid,
     /// Owner.
     pub tenant: String,
+    /// Higher runs earlier; 0 is usual.
+    pub priority: i64,
     /// plan.json text.
     pub plan: String,
     /// `sha256:` of the input's manifest.
@@ -20,6 +27,8 @@ pub struct NewJob {
     pub input_files: i64,
     /// Their size.
     pub input_bytes: i64,
+    /// Memory that the job is expected to need, MiB.
+    pub memory_mb: i64,
     /// Trace of the request.
     pub trace_id: String,
     /// Idempotency-Key of the request.
@@ -38,17 +47,10 @@ pub enum Submitted {
 }
 
 /// Appends the event that tells a job's present row.
-pub(super) async fn record(tx: &mut Transaction<'_, Sqlite>, id: &str, kind: &str) -> sqlx::Result<()> {
-    sqlx::query(concat!(
-        "INSERT INTO event (job, kind, state, stage, progress, eta_s, at) ",
-        "SELECT id, $2, state, stage, progress, eta_s, ",
-        now!(),
-        " FROM job WHERE id = $1"
-    ))
-    .bind(id)
-    .bind(kind)
-    .execute(&mut **tx)
-    .await?;
+pub(super) async fn record(tx: &mut Tx<'_>, id: &str, kind: &str) -> sqlx::Result<()> {
+    let told = "INSERT INTO event (job, kind, state, stage, progress, eta_s, at) \
+                SELECT id, $2, state, stage, progress, eta_s, now_ms() FROM job WHERE id = $1";
+    tx.run(told, args![id, kind]).await?;
     Ok(())
 }
 
@@ -58,24 +60,20 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn submit(&self, job: &NewJob) -> sqlx::Result<Submitted> {
-        let mut tx = self.db().writer.begin_with("BEGIN IMMEDIATE").await?;
-        if let Some(key) = &job.idempotency_key {
-            let earlier: Option<JobRow> =
-                sqlx::query_as("SELECT * FROM job WHERE tenant = $1 AND idempotency_key = $2")
-                    .bind(&job.tenant)
-                    .bind(key)
-                    .fetch_optional(&mut *tx)
-                    .await?;
-            if let Some(row) = earlier {
-                let same = row.input_digest == job.input_digest && row.plan == job.plan;
-                return Ok(if same { Submitted::Replayed(row.into()) } else { Submitted::Mismatch(row.into()) });
-            }
+        let submitted = match self.submit_once(job).await {
+            // Another request with the same key was faster: now its job is there to be found.
+            Err(sqlx::Error::Database(fault)) if fault.is_unique_violation() => self.submit_once(job).await?,
+            other => other?,
+        };
+        if matches!(submitted, Submitted::New(_)) {
+            self.hint(job.id);
         }
-        let row = insert(&mut tx, job).await?;
-        record(&mut tx, &row.id, "state").await?;
-        tx.commit().await?;
-        self.hint(job.id);
-        Ok(Submitted::New(row.into()))
+        Ok(submitted)
+    }
+
+    async fn submit_once(&self, job: &NewJob) -> sqlx::Result<Submitted> {
+        let new = job.clone();
+        self.db().write(Scope::Tenant(&job.tenant), move |tx| Box::pin(async move { accepted(tx, &new).await })).await
     }
 
     /// Cancels: a queued job at once, a running one by asking its worker (see the row's `cancel_requested`).
@@ -84,33 +82,63 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn cancel(&self, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
-        let mut tx = self.db().writer.begin_with("BEGIN IMMEDIATE").await?;
-        let ended = sqlx::query(concat!(
-            "UPDATE job SET state = 'cancelled', cancel_requested = 1, revision = revision + 1, finished_at = ",
-            now!(),
-            " WHERE id = $1 AND tenant = $2 AND state = 'queued'"
-        ))
-        .bind(id.to_string())
-        .bind(tenant)
-        .execute(&mut *tx)
-        .await?
-        .rows_affected();
-        if ended > 0 {
-            record(&mut tx, &id.to_string(), "state").await?;
-        } else {
-            sqlx::query(
-                "UPDATE job SET cancel_requested = 1, revision = revision + 1 \
-                 WHERE id = $1 AND tenant = $2 AND state = 'running' AND cancel_requested = 0",
-            )
-            .bind(id.to_string())
-            .bind(tenant)
-            .execute(&mut *tx)
+        let owner = tenant.to_owned();
+        let row = self
+            .db()
+            .write(Scope::Tenant(tenant), move |tx| {
+                Box::pin(async move {
+                    cancelled(tx, &owner, &id.to_string()).await?;
+                    one(tx, &owner, id).await
+                })
+            })
             .await?;
-        }
-        let row = one(&mut tx, tenant, id).await?;
-        tx.commit().await?;
         self.hint(id);
         Ok(row)
+    }
+
+    /// Cancels every job of a state (queued and running ones without it) that was created before `before` (ms since
+    /// 1970; all without it). Returns the ids of those that are cancelled or being cancelled.
+    ///
+    /// # Errors
+    /// The database's; jobs cancelled before the fault stay cancelled.
+    pub async fn cancel_all(
+        &self,
+        tenant: &str,
+        state: Option<JobState>,
+        before: Option<i64>,
+    ) -> sqlx::Result<Vec<Uuid>> {
+        let words = match state {
+            Some(state) if state.is_final() => return Ok(Vec::new()),
+            Some(state) => [state.as_str(), state.as_str()],
+            None => ["queued", "running"],
+        };
+        let mut ids: Vec<Uuid> = Vec::new();
+        loop {
+            let owner = tenant.to_owned();
+            let some = self
+                .db()
+                .write(Scope::Tenant(tenant), move |tx| {
+                    Box::pin(async move {
+                        let pick = "SELECT id FROM job WHERE tenant = $1 AND state IN ($2, $3) AND cancel_requested = 0 \
+                                    AND created_at < $4 ORDER BY id LIMIT $5 FOR UPDATE";
+                        let values = args![&owner, words[0], words[1], before.unwrap_or(i64::MAX), BULK];
+                        let mut ids = Vec::new();
+                        for row in tx.rows(pick, values).await? {
+                            let id: String = row.get("id")?;
+                            cancelled(tx, &owner, &id).await?;
+                            ids.extend(Uuid::parse_str(&id).ok());
+                        }
+                        Ok(ids)
+                    })
+                })
+                .await?;
+            some.iter().for_each(|id| self.hint(*id));
+            let last = i64::try_from(some.len()).unwrap_or(BULK) < BULK;
+            ids.extend(some);
+            if last {
+                return Ok(ids);
+            }
+        }
     }
 
     /// Puts a failed job back into the queue with all its attempts. Returns the row after, or `None` when it is not
@@ -119,24 +147,22 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn retry(&self, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
-        let mut tx = self.db().writer.begin_with("BEGIN IMMEDIATE").await?;
-        let back = sqlx::query(concat!(
-            "UPDATE job SET state = 'queued', attempt = 0, error = NULL, stage = NULL, progress = 0, eta_s = NULL, ",
-            "cancel_requested = 0, started_at = NULL, finished_at = NULL, revision = revision + 1, run_at = ",
-            now!(),
-            " WHERE id = $1 AND tenant = $2 AND state = 'failed'"
-        ))
-        .bind(id.to_string())
-        .bind(tenant)
-        .execute(&mut *tx)
-        .await?
-        .rows_affected();
-        if back == 0 {
-            return Ok(None);
-        }
-        record(&mut tx, &id.to_string(), "state").await?;
-        let row = one(&mut tx, tenant, id).await?;
-        tx.commit().await?;
+        let owner = tenant.to_owned();
+        let row = self
+            .db()
+            .write(Scope::Tenant(tenant), move |tx| {
+                Box::pin(async move {
+                    let back = "UPDATE job SET state = 'queued', attempt = 0, error = NULL, stage = NULL, progress = 0, \
+                        eta_s = NULL, cancel_requested = 0, started_at = NULL, finished_at = NULL, expires_at = NULL, \
+                        revision = revision + 1, run_at = now_ms() WHERE id = $1 AND tenant = $2 AND state = 'failed'";
+                    if tx.run(back, args![id, &owner]).await? == 0 {
+                        return Ok(None);
+                    }
+                    record(tx, &id.to_string(), "state").await?;
+                    one(tx, &owner, id).await
+                })
+            })
+            .await?;
         self.hint(id);
         Ok(row)
     }
@@ -147,43 +173,59 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn erase(&self, tenant: &str, id: Uuid) -> sqlx::Result<bool> {
-        let gone = sqlx::query("DELETE FROM job WHERE id = $1 AND tenant = $2")
-            .bind(id.to_string())
-            .bind(tenant)
-            .execute(&self.db().writer)
-            .await?
-            .rows_affected();
+        let sql = "DELETE FROM job WHERE id = $1 AND tenant = $2";
+        let gone = self.db().run(Scope::Tenant(tenant), sql, args![id, tenant]).await?;
         self.hint(id);
         Ok(gone > 0)
     }
 }
 
-async fn insert(tx: &mut Transaction<'_, Sqlite>, job: &NewJob) -> sqlx::Result<JobRow> {
-    sqlx::query_as(concat!(
-        "INSERT INTO job (id, tenant, kind, state, plan, input_digest, input_files, input_bytes, trace_id, ",
-        "idempotency_key, run_at, created_at) VALUES ($1, $2, 'reconstruction', $3, $4, $5, $6, $7, $8, $9, ",
-        now!(),
-        ", ",
-        now!(),
-        ") RETURNING *"
-    ))
-    .bind(job.id.to_string())
-    .bind(&job.tenant)
-    .bind(JobState::Queued)
-    .bind(&job.plan)
-    .bind(&job.input_digest)
-    .bind(job.input_files)
-    .bind(job.input_bytes)
-    .bind(&job.trace_id)
-    .bind(&job.idempotency_key)
-    .fetch_one(&mut **tx)
-    .await
+async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Submitted> {
+    if let Some(key) = &job.idempotency_key {
+        let earlier = "SELECT * FROM job WHERE tenant = $1 AND idempotency_key = $2";
+        if let Some(row) = tx.row(earlier, args![&job.tenant, key]).await? {
+            let row = JobRow::of(&row)?;
+            let same = row.input_digest == job.input_digest && row.plan == job.plan;
+            return Ok(if same { Submitted::Replayed(row.into()) } else { Submitted::Mismatch(row.into()) });
+        }
+    }
+    let insert = "INSERT INTO job (id, tenant, kind, state, priority, plan, input_digest, input_files, input_bytes, \
+        memory_mb, trace_id, idempotency_key, rank, run_at, created_at) \
+        VALUES ($1, $2, 'reconstruction', 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms()) \
+        RETURNING *";
+    let values = args![
+        job.id,
+        &job.tenant,
+        job.priority,
+        &job.plan,
+        &job.input_digest,
+        job.input_files,
+        job.input_bytes,
+        job.memory_mb,
+        &job.trace_id,
+        &job.idempotency_key,
+        job.priority.saturating_mul(AGEING_MS),
+    ];
+    let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
+    record(tx, &job.id.to_string(), "state").await?;
+    Ok(Submitted::New(JobRow::of(&row)?.into()))
 }
 
-async fn one(tx: &mut Transaction<'_, Sqlite>, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
-    sqlx::query_as("SELECT * FROM job WHERE id = $1 AND tenant = $2")
-        .bind(id.to_string())
-        .bind(tenant)
-        .fetch_optional(&mut **tx)
-        .await
+/// Cancels a queued job, asks for the end of a running one, leaves others alone.
+async fn cancelled(tx: &mut Tx<'_>, tenant: &str, id: &str) -> sqlx::Result<()> {
+    let at_once = "UPDATE job SET state = 'cancelled', cancel_requested = 1, revision = revision + 1, \
+                   finished_at = now_ms() WHERE id = $1 AND tenant = $2 AND state = 'queued'";
+    if tx.run(at_once, args![id, tenant]).await? > 0 {
+        record(tx, id, "state").await?;
+        return settle(tx, id).await;
+    }
+    let ask = "UPDATE job SET cancel_requested = 1, revision = revision + 1 \
+               WHERE id = $1 AND tenant = $2 AND state = 'running' AND cancel_requested = 0";
+    tx.run(ask, args![id, tenant]).await?;
+    Ok(())
+}
+
+async fn one(tx: &mut Tx<'_>, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
+    let row = tx.row("SELECT * FROM job WHERE id = $1 AND tenant = $2", args![id, tenant]).await?;
+    row.as_ref().map(JobRow::of).transpose()
 }

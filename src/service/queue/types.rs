@@ -1,12 +1,11 @@
 //! Rows of the table.
 
+use crate::db::Row;
 use serde::{Deserialize, Serialize};
-use sqlx::FromRow;
 
 /// Where a job stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, sqlx::Type, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
-#[sqlx(rename_all = "lowercase")]
 pub enum JobState {
     /// Accepted, waits for a worker.
     Queued,
@@ -32,6 +31,17 @@ impl JobState {
         }
     }
 
+    /// The state of a word of the table.
+    ///
+    /// # Errors
+    /// A word that the table's own check forbids.
+    pub fn of(word: &str) -> sqlx::Result<Self> {
+        [Self::Queued, Self::Running, Self::Succeeded, Self::Failed, Self::Cancelled]
+            .into_iter()
+            .find(|state| state.as_str() == word)
+            .ok_or_else(|| sqlx::Error::Decode(format!("unknown job state {word}").into()))
+    }
+
     /// Whether nothing more happens by itself.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
@@ -39,7 +49,7 @@ impl JobState {
 }
 
 /// What readers see of a job. Times in ms since 1970.
-#[derive(Clone, Debug, FromRow)]
+#[derive(Clone, Debug)]
 pub struct JobRow {
     /// UUID v7 as text, so that ids sort by time.
     pub id: String,
@@ -83,10 +93,45 @@ pub struct JobRow {
     pub started_at: Option<i64>,
     /// End.
     pub finished_at: Option<i64>,
+    /// Erased by itself after this time.
+    pub expires_at: Option<i64>,
+}
+
+impl JobRow {
+    /// Reads a row of `SELECT * FROM job`.
+    ///
+    /// # Errors
+    /// A column that is missing or of another type.
+    pub fn of(row: &Row) -> sqlx::Result<Self> {
+        Ok(Self {
+            id: row.get("id")?,
+            tenant: row.get("tenant")?,
+            kind: row.get("kind")?,
+            state: JobState::of(row.get("state")?)?,
+            priority: row.get("priority")?,
+            plan: row.get("plan")?,
+            input_digest: row.get("input_digest")?,
+            input_files: row.get("input_files")?,
+            input_bytes: row.get("input_bytes")?,
+            attempt: row.get("attempt")?,
+            max_attempts: row.get("max_attempts")?,
+            stage: row.get("stage")?,
+            progress: row.get("progress")?,
+            eta_s: row.get("eta_s")?,
+            cancel_requested: row.flag("cancel_requested")?,
+            error: row.get("error")?,
+            trace_id: row.get("trace_id")?,
+            revision: row.get("revision")?,
+            created_at: row.get("created_at")?,
+            started_at: row.get("started_at")?,
+            finished_at: row.get("finished_at")?,
+            expires_at: row.get("expires_at")?,
+        })
+    }
 }
 
 /// An artefact that the table names.
-#[derive(Clone, Debug, PartialEq, Eq, FromRow)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ArtefactRow {
     /// File name of contract.md.
     pub name: String,
@@ -100,8 +145,21 @@ pub struct ArtefactRow {
     pub object_key: String,
 }
 
+impl ArtefactRow {
+    /// Reads a row of the artefact table.
+    pub(super) fn of(row: &Row) -> sqlx::Result<Self> {
+        Ok(Self {
+            name: row.get("name")?,
+            media_type: row.get("media_type")?,
+            bytes: row.get("bytes")?,
+            digest: row.get("digest")?,
+            object_key: row.get("object_key")?,
+        })
+    }
+}
+
 /// One event of a job.
-#[derive(Clone, Debug, PartialEq, FromRow)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct EventRow {
     /// Grows over all jobs.
     pub id: i64,
@@ -117,4 +175,19 @@ pub struct EventRow {
     pub eta_s: Option<f64>,
     /// When, ms since 1970.
     pub at: i64,
+}
+
+impl EventRow {
+    /// Reads a row of the event table.
+    pub(super) fn of(row: &Row) -> sqlx::Result<Self> {
+        Ok(Self {
+            id: row.get("id")?,
+            kind: row.get("kind")?,
+            state: JobState::of(row.get("state")?)?,
+            stage: row.get("stage")?,
+            progress: row.get("progress")?,
+            eta_s: row.get("eta_s")?,
+            at: row.get("at")?,
+        })
+    }
 }

@@ -247,7 +247,7 @@ async fn a_stopped_server_hands_its_job_back_uncounted() {
     let folder = service.stop().await;
     let server = service::Server::start(support::config(folder.path())).await.unwrap();
     let base = format!("http://{}", server.address());
-    let job = support::ended(&reqwest::Client::new(), &base, &id).await;
+    let job = support::ended(&support::client(), &base, &id).await;
     assert_eq!((&job["state"], &job["attempt"]), (&json!("succeeded"), &json!(1)));
     server.stop().await;
 }

@@ -12,9 +12,11 @@ use crate::error::Problem;
 use crate::queue::Claim;
 use axum::http::StatusCode;
 use futures::StreamExt as _;
-use rustix::process::{Pid, Signal, kill_process_group};
+use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process_group, prlimit};
 use serde::Deserialize;
 use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tokio::process::{ChildStdin, ChildStdout, Command};
 use tokio_util::codec::{FramedRead, LinesCodec};
@@ -48,6 +50,8 @@ pub(super) enum Ended {
     Problem(Problem),
     /// Ended by a signal, or without a word.
     Crashed(String),
+    /// Ended because an allocation was refused.
+    OutOfMemory,
     /// Ended because the owner cancelled.
     Cancelled,
     /// Ended because the server stops.
@@ -61,16 +65,19 @@ pub(super) struct Child {
     group: Option<Pid>,
     lines: FramedRead<ChildStdout, LinesCodec>,
     error: Option<Problem>,
+    /// Set when its last words are those of an allocation that failed.
+    out_of_memory: Arc<AtomicBool>,
+    said: Option<tokio::task::JoinHandle<()>>,
     /// Held open: the child ends when it closes.
     _stdin: Option<ChildStdin>,
 }
 
 impl Child {
-    /// Starts the child of a claimed job.
+    /// Starts the child of a claimed job, bound to `memory_mb` of memory.
     ///
     /// # Errors
     /// The program cannot be started.
-    pub(super) fn start(config: &Config, folder: &Folder, claim: &Claim) -> anyhow::Result<Self> {
+    pub(super) fn start(config: &Config, folder: &Folder, claim: &Claim, memory_mb: i64) -> anyhow::Result<Self> {
         let mut command = Command::new(&config.executable);
         command.args(&config.executable_args).arg("exec-job");
         command.arg("--input").arg(folder.input()).arg("--plan").arg(folder.plan());
@@ -81,11 +88,16 @@ impl Child {
         let mut process =
             command.spawn().map_err(|e| anyhow::anyhow!("cannot start {}: {e}", config.executable.display()))?;
         let stdout = process.stdout.take().ok_or_else(|| anyhow::anyhow!("the child has no stdout"))?;
-        if let Some(stderr) = process.stderr.take() {
-            tokio::spawn(log(stderr, claim.id.clone(), claim.trace_id.clone()));
-        }
+        let out_of_memory = Arc::new(AtomicBool::new(false));
+        let said = process.stderr.take().map(|stderr| {
+            tokio::spawn(log(stderr, claim.id.clone(), claim.trace_id.clone(), Arc::clone(&out_of_memory)))
+        });
+        let group = process.id().and_then(|id| Pid::from_raw(i32::try_from(id).ok()?));
+        bound(group, memory_mb);
         Ok(Self {
-            group: process.id().and_then(|id| Pid::from_raw(i32::try_from(id).ok()?)),
+            group,
+            out_of_memory,
+            said,
             _stdin: process.stdin.take(),
             lines: FramedRead::new(stdout, LinesCodec::new_with_max_length(LONGEST_LINE)),
             error: None,
@@ -141,10 +153,15 @@ impl Child {
     pub(super) async fn end(&mut self, job: &str) -> anyhow::Result<Ended> {
         let status = self.process.wait().await?;
         self.signal(Signal::KILL);
+        if let Some(said) = self.said.take() {
+            // Its last words tell a lack of memory from another crash.
+            let _ = tokio::time::timeout(DRAIN, said).await;
+        }
         let problem = self.error.take().map(|p| completed(p, job));
         Ok(match (status.code(), problem) {
             (Some(0), _) => Ended::Done,
             (Some(_), Some(problem)) => Ended::Problem(problem),
+            (_, None) if self.out_of_memory.load(Ordering::Acquire) => Ended::OutOfMemory,
             (Some(code @ 2..=4), None) => Ended::Problem(unexplained(code)),
             (Some(code), None) => Ended::Crashed(format!("exit code {code}")),
             (None, _) => Ended::Crashed(status.to_string()),
@@ -211,11 +228,28 @@ fn unexplained(code: i32) -> Problem {
     )
 }
 
-async fn log(stderr: tokio::process::ChildStderr, job: String, trace_id: String) {
+/// Bounds the data of a process (heap and private mappings, not reserved addresses): an allocation beyond it fails.
+fn bound(process: Option<Pid>, memory_mb: i64) {
+    let bytes = u64::try_from(memory_mb).unwrap_or(0).saturating_mul(1 << 20);
+    if let (Some(pid), true) = (process, bytes > 0) {
+        let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
+        if let Err(error) = prlimit(Some(pid), Resource::Data, limit) {
+            tracing::warn!(%error, "the job's memory is not bound");
+        }
+    }
+}
+
+/// What programs say when an allocation is refused.
+const MEMORY_WORDS: &[&str] = &["memory allocation of", "MemoryError", "std::bad_alloc", "out of memory"];
+
+async fn log(stderr: tokio::process::ChildStderr, job: String, trace_id: String, out_of_memory: Arc<AtomicBool>) {
     let mut lines = FramedRead::new(stderr, LinesCodec::new_with_max_length(LONGEST_LINE));
     while let Some(line) = lines.next().await {
         match line {
-            Ok(text) => tracing::info!(target: "job", %job, %trace_id, "{text}"),
+            Ok(text) => {
+                out_of_memory.store(MEMORY_WORDS.iter().any(|words| text.contains(words)), Ordering::Release);
+                tracing::info!(target: "job", %job, %trace_id, "{text}");
+            }
             Err(tokio_util::codec::LinesCodecError::MaxLineLengthExceeded) => {}
             Err(_) => return,
         }

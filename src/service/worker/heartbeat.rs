@@ -6,10 +6,8 @@
 
 use super::child::Step;
 use super::owner::Owner;
-use crate::db::{self, Db};
 use crate::queue::{Beat, LEASE_MS, Queue, Verdict};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -21,7 +19,7 @@ const BEAT: Duration = Duration::from_secs(1);
 /// Shortest time between beats, so that a chatty job cannot keep the writer busy.
 const SHORTEST: Duration = Duration::from_millis(100);
 /// Between looks for leases that ran out and owners that died.
-const RESCUE: Duration = Duration::from_secs(3);
+const RESCUE: Duration = Duration::from_secs(2);
 
 #[derive(Debug)]
 struct Entry {
@@ -60,14 +58,14 @@ fn locked(entries: &Entries) -> MutexGuard<'_, BTreeMap<(Uuid, i64), Entry>> {
 }
 
 impl Heartbeat {
-    /// Starts the thread on its own connection to `database`.
+    /// Starts the thread on its own connection to the queue's database.
     ///
     /// # Errors
     /// The thread cannot be started.
-    pub fn start(queue: &Queue, database: PathBuf, owner: Arc<Owner>) -> std::io::Result<Self> {
+    pub fn start(queue: &Queue, owner: Arc<Owner>) -> std::io::Result<Self> {
         let entries: Entries = Entries::default();
         let (calls, inbox) = channel();
-        let beats = Beats { queue: queue.clone(), database, owner, entries: Arc::clone(&entries) };
+        let beats = Beats { queue: queue.clone(), owner, entries: Arc::clone(&entries) };
         let thread = std::thread::Builder::new().name("heartbeat".to_owned()).spawn(move || beats.run(&inbox))?;
         Ok(Self { entries, calls, thread: Some(thread) })
     }
@@ -157,7 +155,6 @@ impl Drop for Held {
 
 struct Beats {
     queue: Queue,
-    database: PathBuf,
     owner: Arc<Owner>,
     entries: Entries,
 }
@@ -193,13 +190,13 @@ impl Beats {
             }
         }
         if let Some(queue) = queue {
-            runtime.block_on(queue.db().writer.close());
+            runtime.block_on(queue.db().close());
         }
     }
 
     async fn connect(&self) -> Option<Queue> {
-        match db::writer(&self.database).await {
-            Ok(writer) => Some(self.queue.with_db(Db { reader: writer.clone(), writer })),
+        match self.queue.db().for_thread().await {
+            Ok(db) => Some(self.queue.with_db(db)),
             Err(error) => {
                 tracing::warn!(%error, "no database connection for beats");
                 None

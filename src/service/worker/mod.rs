@@ -10,15 +10,18 @@
 mod child;
 mod folder;
 mod heartbeat;
+mod memory;
 mod owner;
 
 pub use heartbeat::Heartbeat;
+pub use memory::Memory;
+pub(crate) use memory::expected_mb;
 pub use owner::Owner;
 
 use crate::config::Config;
 use crate::error::Problem;
 use crate::media::media_type;
-use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict};
+use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict, WorkerRow};
 use crate::store::Store;
 use child::{Child, Ended};
 use folder::Folder;
@@ -31,6 +34,9 @@ use tokio_util::sync::CancellationToken;
 const POLL: Duration = Duration::from_secs(1);
 /// Pause of a slot after a fault of the database.
 const PAUSE: Duration = Duration::from_secs(2);
+
+/// Between lines on the roll of workers.
+const ROLL: Duration = Duration::from_secs(10);
 
 /// What every slot shares.
 #[derive(Debug)]
@@ -45,6 +51,8 @@ pub struct Worker {
     pub heartbeat: Heartbeat,
     /// Who we are in `lease_owner`.
     pub owner: Arc<Owner>,
+    /// What jobs may take together.
+    pub memory: Memory,
     /// Ends everything.
     pub shutdown: CancellationToken,
 }
@@ -54,7 +62,7 @@ impl Worker {
     pub async fn slot(self: Arc<Self>) {
         let mut changes = self.queue.changes();
         while !self.shutdown.is_cancelled() {
-            match self.queue.claim(self.owner.name()).await {
+            match self.queue.claim(self.owner.name(), self.memory.room()).await {
                 Ok(Some(claim)) => self.job(&claim).await,
                 Ok(None) => tokio::select! {
                     () = self.shutdown.cancelled() => {}
@@ -75,6 +83,7 @@ impl Worker {
     /// Runs one claimed job to its end.
     async fn job(&self, claim: &Claim) {
         let held = self.heartbeat.hold(claim.uuid(), claim.fence);
+        let _share = self.memory.take(claim.memory_mb);
         tracing::info!(job = %claim.id, attempt = claim.attempt, trace_id = %claim.trace_id, "job starts");
         let closing = match self.run(claim, &held).await {
             Ok(closing) => closing,
@@ -99,7 +108,7 @@ impl Worker {
             };
         }
         tokio::fs::write(folder.plan(), &claim.plan).await?;
-        let mut child = Child::start(&self.config, &folder, claim)?;
+        let mut child = Child::start(&self.config, &folder, claim, self.memory.each())?;
         let ended = self.watch(&mut child, held, claim).await?;
         let closing = match ended {
             Some(Ended::Done) => match held.verdict() {
@@ -108,6 +117,7 @@ impl Worker {
             },
             Some(Ended::Problem(problem)) => Some(Closing::Failed(problem)),
             Some(Ended::Crashed(how)) => Some(Closing::Crashed(how)),
+            Some(Ended::OutOfMemory) => Some(Closing::OutOfMemory(self.memory.each())),
             Some(Ended::Cancelled) => Some(Closing::Cancelled),
             Some(Ended::HandedBack) => Some(Closing::HandedBack),
             None => None,
@@ -120,6 +130,9 @@ impl Worker {
     async fn watch(&self, child: &mut Child, held: &Held, claim: &Claim) -> anyhow::Result<Option<Ended>> {
         let mut changes = self.queue.changes();
         let mut verdict = held.subscribe();
+        let longest = Duration::from_secs(self.config.job_seconds);
+        let end = tokio::time::sleep(longest);
+        tokio::pin!(end);
         loop {
             tokio::select! {
                 line = child.next() => match line {
@@ -138,11 +151,41 @@ impl Worker {
                         return Ok((now == Verdict::Cancel).then_some(Ended::Cancelled));
                     }
                 }
+                () = &mut end, if !longest.is_zero() => {
+                    child.kill().await;
+                    return Ok(Some(Ended::Problem(too_long(longest, &claim.id))));
+                }
                 () = self.shutdown.cancelled() => {
                     child.kill().await;
                     return Ok(Some(Ended::HandedBack));
                 }
             }
+        }
+    }
+
+    /// Keeps this worker on the roll until shutdown.
+    pub async fn roll(self: Arc<Self>) {
+        while !self.shutdown.is_cancelled() {
+            let row = WorkerRow {
+                id: self.owner.name().to_owned(),
+                host: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
+                version: env!("CARGO_PKG_VERSION").to_owned(),
+                slots: i64::try_from(self.config.workers).unwrap_or(i64::MAX),
+                busy: i64::try_from(self.heartbeat.held()).unwrap_or(i64::MAX),
+                memory_mb: self.memory.all(),
+                started_at: 0,
+                seen_at: 0,
+            };
+            if let Err(error) = self.queue.enrol(&row).await {
+                tracing::warn!(%error, "not on the roll of workers");
+            }
+            tokio::select! {
+                () = self.shutdown.cancelled() => {}
+                () = tokio::time::sleep(ROLL) => {}
+            }
+        }
+        if let Err(error) = self.queue.strike_off(self.owner.name()).await {
+            tracing::debug!(%error, "still on the roll of workers, for a minute");
         }
     }
 
@@ -204,4 +247,15 @@ impl Worker {
             tracing::warn!(job = %claim.id, %error, "files left behind; the sweep at the next start takes them");
         }
     }
+}
+
+fn too_long(longest: Duration, job: &str) -> Problem {
+    let detail = format!(
+        "The job ran for {} seconds, the most that this service gives to one job. Send a smaller volume, or ask the \
+         operator for more time.",
+        longest.as_secs()
+    );
+    let mut problem = Problem::new(axum::http::StatusCode::UNPROCESSABLE_ENTITY, "job.time", detail);
+    problem.instance = format!("/v1/jobs/{job}");
+    problem
 }

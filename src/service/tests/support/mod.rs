@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, dead_code, unreachable_pub, missing_docs)]
 
+pub mod postgres;
+
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode, multipart};
 use serde_json::Value;
 use service::{Auth, Config, Server};
@@ -27,6 +29,9 @@ step("read", 0.1)
 do = plan.get("do", "work")
 if do == "crash": os.kill(os.getpid(), 9)
 if do == "silent": sys.exit(0)
+if do == "allocate":
+    hoard = []
+    while True: hoard.append(bytearray(1 << 24))
 if do == "input":
     print(json.dumps({"error": {"status": 422, "code": "stack.black", "detail": "every pixel is 0",
           "errors": [{"code": "stack.black", "message": "every pixel is 0", "where": {"slice": 3}}]}}), flush=True)
@@ -83,7 +88,7 @@ impl Service {
         let mut config = config(folder.path());
         change(&mut config);
         let server = Server::start(config).await.unwrap();
-        Self { base: format!("http://{}", server.address()), server: Some(server), client: Client::new(), folder }
+        Self { base: format!("http://{}", server.address()), server: Some(server), client: client(), folder }
     }
 
     pub fn data(&self) -> PathBuf {
@@ -131,12 +136,23 @@ impl Service {
     }
 }
 
+/// A client; its TLS provider must be there first.
+pub fn client() -> Client {
+    service::tls::provide();
+    Client::new()
+}
+
 pub fn upload(client: &Client, base: &str, plan: &Value) -> RequestBuilder {
+    upload_to(client, &format!("{base}/v1/jobs"), plan)
+}
+
+/// The same to an address with a query.
+pub fn upload_to(client: &Client, url: &str, plan: &Value) -> RequestBuilder {
     let form = multipart::Form::new()
         .text("plan", plan.to_string())
         .part("input", multipart::Part::bytes(b"second".to_vec()).file_name("scan/b.png"))
         .part("input", multipart::Part::bytes(b"first".to_vec()).file_name("scan/a.png"));
-    client.post(format!("{base}/v1/jobs")).multipart(form)
+    client.post(url).multipart(form)
 }
 
 pub async fn ended(client: &Client, base: &str, id: &str) -> Value {

@@ -1,6 +1,6 @@
 """Thinning of one volume by ours, gaara and scikit-image, interleaved; run by `cargo xtask bench thinning`.
 
-    python tests/python/bench_thinning.py PATH_TO_OUR_EXAMPLE WORK_FOLDER REPEAT
+    python tests/bench/thinning.py PATH_TO_OUR_EXAMPLE WORK_FOLDER REPEAT
 
 Only the thinning itself is timed, on an array in memory, one and two threads where the program has them (scikit-image
 has none and runs once at 512^3, where it takes a minute). gaara is timed on an array in C order, numpy's default, and in

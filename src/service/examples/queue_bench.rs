@@ -1,0 +1,178 @@
+//! The queue by itself, without children: `queue_bench sqlite|postgres [--large N]` (`cargo xtask bench queue`).
+//!
+//! Shows durable no-op jobs per second (accepted, claimed, ended; each step committed and synced), the same drain with
+//! 10^3 and with N (10^6) jobs queued, and the time from a job's acceptance to its start while the queue is quiet.
+
+use anyhow::{Context as _, Result, bail};
+use service::db::{Db, Scope, Value};
+use service::queue::{ArtefactRow, Closing, NewJob, Published, Queue, Room};
+use service::{Auth, Config};
+use std::time::{Duration, Instant};
+use uuid::Uuid;
+
+#[path = "../tests/support/postgres.rs"]
+#[allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, dead_code, unreachable_pub, missing_docs)]
+mod postgres;
+
+/// Callers and workers at the same time: what a busy service has.
+const AT_ONCE: usize = 64;
+/// Jobs of one measurement.
+const JOBS: usize = 4000;
+/// Jobs whose start is timed.
+const STARTS: usize = 300;
+
+fn main() -> Result<()> {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let large = match words.iter().position(|w| w == "--large") {
+        Some(at) => words.get(at + 1).context("a number is missing")?.parse()?,
+        None => 1_000_000_i64,
+    };
+    tokio::runtime::Runtime::new()?.block_on(bench(words.first().map_or("sqlite", String::as_str), large))
+}
+
+async fn bench(kind: &str, large: i64) -> Result<()> {
+    let folder = tempfile::TempDir::new()?;
+    let mut config = Config { data_dir: folder.path().to_owned(), auth: Auth::None, ..Config::default() };
+    match kind {
+        "sqlite" => {}
+        "postgres" => {
+            let cluster = postgres::cluster().context("PostgreSQL is not installed")?;
+            config.database_url = Some(cluster.database());
+            config.database_connections = 32;
+        }
+        _ => bail!("sqlite or postgres"),
+    }
+    let queue = Queue::new(Db::open(&config).await?);
+    let begun = Instant::now();
+    accept(&queue, JOBS).await?;
+    let accepted = begun.elapsed();
+    let drained = drain(&queue, JOBS).await?;
+    let whole = accepted + drained;
+    println!(
+        "{kind}: {:.0} no-op jobs/s ({:.0} accepted/s, {:.0} claimed and ended/s)",
+        rate(JOBS, whole),
+        rate(JOBS, accepted),
+        rate(JOBS, drained)
+    );
+    fill(&queue, 1000).await?;
+    let small = rate(1000, drain(&queue, 1000).await?);
+    fill(&queue, large).await?;
+    if kind == "postgres" {
+        queue.db().run(Scope::System, "ANALYZE job", Vec::new()).await?;
+    }
+    let full = rate(1000, drain(&queue, 1000).await?);
+    println!("{kind}: drain {small:.0}/s at 10^3 queued, {full:.0}/s at {large} ({:.0} %)", 100.0 * full / small);
+    queue.db().run(Scope::System, "DELETE FROM job WHERE state = 'queued'", Vec::new()).await?;
+    let times = starts(&queue).await?;
+    println!("{kind}: accepted to started p50 {:?}, p99 {:?}", times[times.len() / 2], times[times.len() * 99 / 100]);
+    queue.db().close().await;
+    Ok(())
+}
+
+#[allow(clippy::cast_precision_loss, reason = "counts are small")]
+fn rate(jobs: usize, time: Duration) -> f64 {
+    jobs as f64 / time.as_secs_f64()
+}
+
+fn job() -> NewJob {
+    NewJob {
+        id: Uuid::now_v7(),
+        tenant: "default".to_owned(),
+        priority: 0,
+        plan: "{}".to_owned(),
+        input_digest: "sha256:0".to_owned(),
+        input_files: 1,
+        input_bytes: 1,
+        memory_mb: 0,
+        trace_id: "0".to_owned(),
+        idempotency_key: None,
+    }
+}
+
+async fn accept(queue: &Queue, jobs: usize) -> Result<()> {
+    let callers: Vec<_> = (0..AT_ONCE)
+        .map(|k| {
+            let queue = queue.clone();
+            tokio::spawn(async move {
+                for _ in (k..jobs).step_by(AT_ONCE) {
+                    queue.submit(&job()).await?;
+                }
+                anyhow::Ok(())
+            })
+        })
+        .collect();
+    for caller in callers {
+        caller.await??;
+    }
+    Ok(())
+}
+
+async fn drain(queue: &Queue, jobs: usize) -> Result<Duration> {
+    let begun = Instant::now();
+    let workers: Vec<_> = (0..AT_ONCE)
+        .map(|k| {
+            let queue = queue.clone();
+            tokio::spawn(async move {
+                let owner = format!("w{k}");
+                let mut left = (k..jobs).step_by(AT_ONCE).count();
+                while left > 0 {
+                    let Some(claim) = queue.claim(&owner, Room::Any).await? else {
+                        tokio::time::sleep(Duration::from_millis(1)).await;
+                        continue;
+                    };
+                    queue.close(&claim, &success()).await?;
+                    left -= 1;
+                }
+                anyhow::Ok(())
+            })
+        })
+        .collect();
+    for worker in workers {
+        worker.await??;
+    }
+    Ok(begun.elapsed())
+}
+
+fn success() -> Closing {
+    let artefact = ArtefactRow {
+        name: "result.json".to_owned(),
+        media_type: "application/json".to_owned(),
+        bytes: 2,
+        digest: "sha256:1".to_owned(),
+        object_key: "k".to_owned(),
+    };
+    Closing::Succeeded(Published { artefacts: vec![artefact] })
+}
+
+async fn fill(queue: &Queue, jobs: i64) -> Result<()> {
+    let sql = "INSERT INTO job (id, tenant, kind, state, plan, input_digest, input_files, input_bytes, trace_id, rank, \
+        run_at, created_at) WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < $1) \
+        SELECT 'x' || CAST($1 AS TEXT) || '.' || CAST(k AS TEXT), 'default', 'r', 'queued', '{}', 'd', 1, 1, 't', k, 0, 0 FROM n";
+    queue.db().run(Scope::System, sql, vec![Value::from(jobs)]).await?;
+    Ok(())
+}
+
+/// Times from a caller's 202 to the claim of a worker that waits for hints, shortest first.
+async fn starts(queue: &Queue) -> Result<Vec<Duration>> {
+    let mut changes = queue.changes();
+    let worker = queue.clone();
+    let (started, mut times) = tokio::sync::mpsc::unbounded_channel();
+    let task = tokio::spawn(async move {
+        while changes.recv().await.is_ok() {
+            while let Ok(Some(claim)) = worker.claim("w", Room::Any).await {
+                let _ = started.send((claim.uuid(), Instant::now()));
+            }
+        }
+    });
+    let mut waits = Vec::new();
+    for _ in 0..STARTS {
+        let new = job();
+        queue.submit(&new).await?;
+        let accepted = Instant::now();
+        let (_, at) = times.recv().await.context("the worker ended")?;
+        waits.push(at.saturating_duration_since(accepted));
+    }
+    task.abort();
+    waits.sort();
+    Ok(waits)
+}
