@@ -102,13 +102,14 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
                        area) is not given back";
         warnings.push(Warning::new("contours.thickness_unknown", message, Place::none()));
     }
-    let curves = ctx.map_range(outlines.len(), |i| {
+    let mut curves = ctx.map_range(outlines.len(), |i| {
         let (k, o) = outlines[i];
         let outline = &drawn[k].outlines[o];
         let drawn_small = interpolation(stack, axis);
         let variance = acquired.map(|b| b.in_plane(&planes[outline.plane]));
         curve(outline, &smooth[i], o, variance.map(|v| [v[0] + drawn_small[0], v[1] + drawn_small[1]]), stack)
     })?;
+    crate::agreement::widen_errors(&mut curves, &planes);
     let ends = ends(stack, &s, axis, &drawn, &planes);
     warnings.extend(ends.warnings);
     let report = Report {

@@ -2,6 +2,7 @@
 //!
 //! [`contours()`] is the whole; [`segment()`] its first half. Lumens are brighter than their surroundings.
 
+mod agreement;
 mod blur;
 mod candidate;
 mod contours;
