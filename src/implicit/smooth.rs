@@ -3,7 +3,7 @@
 //! The filter is 2 G - G*G with G a Gaussian ("twicing"), not G alone: G shrinks a vessel of radius R by sigma^2 / 2R
 //! (sigma = .5 mm, R = 3 mm: .042 mm, 2.8 % of the area), the twiced filter by sigma^4 / 4R^3 (6e-4 mm, .04 %), while
 //! both remove what is shorter than about 3 sigma. docs/adr/0003 has the figures. The largest sigma within the bound is
-//! found by bisection on displacements measured in both directions.
+//! found by a guarded secant search on displacements measured in both directions.
 
 use crate::{Error, Field, Sampled, SampledSettings, foot};
 use exec::Ctx;
@@ -47,10 +47,16 @@ pub struct SmoothReport {
     pub backward_mm: f64,
 }
 
-/// Share of the bound that the bisection aims at: the rest is for wall between the points it measures.
+/// Share of the bound that the search aims at: the rest is for wall between the points it measures.
 const AIM: f64 = 0.9;
-/// Steps of the bisection: sigma to 1 % of its largest.
-const STEPS: usize = 7;
+/// A displacement of at least this share of the aim ends the search: sigma is then within 6 % of the largest.
+const NEAR: f64 = 0.8;
+/// Most filters tried; each costs six passes over the lattice.
+const ATTEMPTS: usize = 8;
+/// Feet are sought within this many bounds.
+const REACH: f64 = 3.0;
+/// The twiced Gaussian moves a smooth wall by sigma^4, a rough one by less: the power of the next guess.
+const POWER: f64 = 3.0;
 
 /// The smoothed field of the largest sigma (at most `sigma_limit_mm`) whose wall stays within the bound of the `wall`
 /// points, which lie on the zero level of `sampled`.
@@ -65,29 +71,27 @@ pub fn smooth(
     ctx: &Ctx,
 ) -> Result<(Sampled, SmoothReport), Error> {
     let bound = AIM * settings.max_displacement_px * settings.pixel_mm;
-    let attempt = |sigma: f64| -> Result<Option<(Sampled, SmoothReport)>, Error> {
-        let field = sampled.smoothed(sigma, ctx)?;
-        let moved = displacement(sampled, &field, wall, 2.0 * bound, ctx)?;
-        Ok(moved
-            .filter(|m| m.0.max(m.1) <= bound)
-            .map(|(forward_mm, backward_mm)| (field, SmoothReport { sigma_mm: sigma, forward_mm, backward_mm })))
-    };
-    let largest = sigma_limit_mm.min(settings.max_sigma_px * settings.pixel_mm);
-    if let Some(found) = attempt(largest)? {
-        return Ok(found);
-    }
-    let (mut low, mut high) = (0.0, largest);
+    let (mut low, mut high) = (0.0, sigma_limit_mm.min(settings.max_sigma_px * settings.pixel_mm));
+    let mut sigma = high;
     let mut best = None;
-    for step in 0..STEPS {
-        ctx.progress(step as f64 / STEPS as f64);
-        let middle = 0.5 * (low + high);
-        match attempt(middle)? {
-            Some(found) => {
-                low = middle;
-                best = Some(found);
+    for step in 0..ATTEMPTS {
+        ctx.progress(step as f64 / ATTEMPTS as f64);
+        let field = sampled.smoothed(sigma, ctx)?;
+        let moved = displacement(sampled, &field, wall, REACH * bound, ctx)?;
+        let share = moved.map(|(forward, backward)| forward.max(backward) / bound);
+        match (moved, share) {
+            (Some((forward_mm, backward_mm)), Some(share)) if share <= 1.0 => {
+                best = Some((field, SmoothReport { sigma_mm: sigma, forward_mm, backward_mm }));
+                low = sigma;
+                if share >= NEAR || low == high {
+                    break;
+                }
             }
-            None => high = middle,
+            _ => high = sigma,
         }
+        // towards the middle of what the search aims at, but never so near an end that nothing is learnt
+        let guess = share.map_or(0.0, |share| sigma * (0.5 * (1.0 + NEAR) / share.max(1e-6)).powf(1.0 / POWER));
+        sigma = guess.clamp(low + 0.2 * (high - low), high - 0.05 * (high - low));
     }
     let unsmoothed = SmoothReport { sigma_mm: 0.0, forward_mm: 0.0, backward_mm: 0.0 };
     Ok(best.unwrap_or_else(|| (sampled.clone(), unsmoothed)))

@@ -220,13 +220,7 @@ fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, c
     let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
     let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
     let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
-    let settings = RemeshSettings {
-        edge_mm: plan.surface.edge_mm,
-        max_error_mm: plan.surface.max_error_mm,
-        sizing: Sizing::Curvature,
-        ..RemeshSettings::default()
-    };
-    let (mesh, _) = surface::remesh(&cut, field, &contours.cuts, &settings, &ctx.part(0.2, 0.8))?;
+    let mesh = remeshed(&cut, field, contours, plan, &ctx.part(0.2, 0.8))?;
     let topology = surface::check(&mesh).map_err(surface::Error::from)?;
     let quality = surface::quality(&mesh, field, ctx)?;
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
@@ -235,6 +229,31 @@ fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, c
     let (extended, warnings) = extended(&mesh, field, report.caps.len() as u32, plan, ctx)?;
     let beside = beside(&mesh, &report.caps);
     Ok(Wall { mesh, caps: report.caps, beside, topology, quality, displacement, patches, extended, warnings })
+}
+
+/// Times that the shortest edge is halved where the wall is curved more sharply than it, as in the crotch of two arteries
+/// that run side by side.
+const HALVINGS: i32 = 2;
+
+fn remeshed(
+    cut: &TriMesh,
+    field: &Sampled,
+    contours: &Contours,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<TriMesh, surface::Error> {
+    let [shortest, longest] = plan.surface.edge_mm;
+    let by = |halvings: i32| {
+        let settings = RemeshSettings {
+            edge_mm: [shortest * 0.5_f64.powi(halvings), longest],
+            max_error_mm: plan.surface.max_error_mm,
+            sizing: Sizing::Curvature,
+            ..RemeshSettings::default()
+        };
+        surface::remesh(cut, field, &contours.cuts, &settings, ctx).map(|(mesh, _)| mesh)
+    };
+    let folded = |mesh: &Result<TriMesh, surface::Error>| matches!(mesh, Err(surface::Error::Folded { .. }));
+    (1..=HALVINGS).fold(by(0), |mesh, halvings| if folded(&mesh) { by(halvings) } else { mesh })
 }
 
 /// Flow extensions at every cap. They are for solvers: where one has no room the numbers of the scan still stand, so
