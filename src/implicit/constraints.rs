@@ -74,7 +74,7 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.values.push(offset);
         c.sigma_mm.push(w.sigma_mm.max(PLANAR_NORMAL_ERROR * offset));
     }
-    push_closing(contours, &mut c);
+    push_closing(contours, settings, &mut c);
     c
 }
 
@@ -267,9 +267,18 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
     }
 }
 
+/// A lumen is wide where its centre lies deeper than this many interior offsets.
+const WIDE: f64 = 4.0;
+/// Value of f wanted at the centre of a wide lumen, against its depth. The function is no distance there: half as much is
+/// granted as error.
+const MIDDLE: f64 = 0.7;
+
 /// Exterior points past the ends. Their error is granted as their distance to the wall: they tell where outside is, not
 /// where the wall is.
-fn push_closing(contours: &Contours, c: &mut Constraints) {
+///
+/// In a wide lumen the wall and the points just inside it leave the middle to extrapolation, which noise on the wall may
+/// turn negative (an aorta of 10 mm radius became hollow): its centre is told to lie inside, about as deep as it does.
+fn push_closing(contours: &Contours, settings: &Settings, c: &mut Constraints) {
     let mut push = |position: P3, depth: f64| {
         c.points.push(position);
         c.values.push(-depth);
@@ -283,6 +292,10 @@ fn push_closing(contours: &Contours, c: &mut Constraints) {
         let radius = curve.length_mm() / std::f64::consts::TAU;
         let samples: Vec<P3> = (0..64).map(|k| curve.at(plane, k as f64 / 64.0 * curve.length_mm()).position).collect();
         let Some(centre) = P3::centroid(&samples) else { continue };
+        let depth = samples.iter().map(|p| p.distance(centre)).fold(f64::INFINITY, f64::min);
+        if depth > WIDE * settings.offset_mm && is_inside(plane, &samples, centre) {
+            push(centre, -MIDDLE * depth);
+        }
         for cut in &contours.cuts {
             let parallel = cut.outward.dot(plane.normal()).abs() > 0.999;
             let touching = if parallel {

@@ -74,13 +74,11 @@ impl<'a> Lumen<'a> {
         v.iter().all(|c| c.abs() < 1e9) && self.volume.at(v.map(|c| c as isize))
     }
 
-    /// Whether the straight line between two points stays inside by more than rounding, at steps of half a voxel.
+    /// Whether the straight line between two points stays where f > 0, at steps of half a voxel. (A lumen voxel reaches
+    /// half a voxel into the tissue beyond the wall: it does not tell.)
     pub(crate) fn sees(&self, a: P3, b: P3) -> bool {
         let steps = (a.distance(b) / (0.5 * self.spacing_mm)).ceil().max(1.0) as usize;
-        (1..steps).all(|i| {
-            let x = a.lerp(b, i as f64 / steps as f64);
-            self.voxel(x) || self.domain.field.value(x) > 0.0
-        })
+        (1..steps).all(|i| self.domain.field.value(a.lerp(b, i as f64 / steps as f64)) > 0.0)
     }
 
     /// Length of the straight line between two points that is not lumen, to a quarter of a voxel, mm.

@@ -345,11 +345,15 @@ fn a_vessel_tree_with_many_junctions_and_warnings_keeps_the_rest_countable() {
     }));
     let long = "the wall fades towards the end of the scan over 31.5 mm, the level was followed down to 0.42 of the \
                 half-maximum; look at the contours of these slices before the lengths of the branches are used";
-    f.warnings = (0..8).map(|k| space::Warning::new("level.fades", long, space::Place::slice(k))).collect();
+    let codes = ["a.b", "c.d", "e.f", "g.h", "i.j", "k.l", "m.n", "o.p"];
+    let warning = |(k, &code): (usize, &&'static str)| space::Warning::new(code, long, space::Place::slice(k));
+    f.warnings = codes.iter().enumerate().map(warning).collect();
+    f.warnings.extend((8..11).map(|k| space::Warning::new("a.b", long, space::Place::slice(k))));
     let r = f.reconstruction();
     assert_eq!(r.main_junction().map(|j| j.node), Some(0));
     let text = String::from_utf8(report_html(&r).unwrap()).unwrap();
-    assert!(text.contains("and 4 more in result.json"), "8 + 1 warnings, 5 shown");
+    assert!(text.contains("and 4 more in result.json"), "8 + 1 kinds of warnings, 5 shown");
+    assert!(text.contains("3 more like it"), "warnings of one kind share a line");
     assert!(text.contains("5 more in angles.csv"), "20 junctions, 1 + 14 shown");
     leave("many", &[NamedBytes::new(REPORT_HTML, text.into_bytes())]);
 }
