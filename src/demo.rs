@@ -35,6 +35,7 @@ async fn whole(a: &Demo) -> Result<()> {
     let truth: Value = serde_json::from_slice(&fs::read(scan.join("truth.json"))?)?;
 
     let server = Server::start(&a.out.join("data"))?;
+    service::tls::provide();
     let client = Client::new();
     let job = upload(&client, &server.address, &scan).await?;
     let id = job["id"].as_str().context("the service gave no job id")?;
