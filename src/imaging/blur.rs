@@ -7,7 +7,8 @@
 //! this is kappa/2 det(Sigma)/(n' Sigma n), which is kappa/2 (sigma^2 + px^2/12) for square pixels: exact for a vessel at
 //! a right angle to the plane. [`crate::contours()`] applies the planar form; the implicit fit puts the spatial one in its
 //! place, because an oblique vessel in slices of 3 mm loses 1 to 2 % of its area that no planar form gives back.
-//! Where the thickness is not known its term is left out.
+//! Where the thickness is not known the distance of the slices is taken for it, with a warning: slices without gap or
+//! overlap are the rule, and a scan must not change when it comes as NIfTI, which does not carry the thickness.
 
 use crate::{CurvePoint, Plane, Stack};
 use space::{DMat3, V3};
@@ -19,7 +20,7 @@ pub struct Blur {
     pub axes: [V3; 3],
     /// Variances along the row and the column direction, mm^2.
     pub in_slice_mm2: [f64; 2],
-    /// Variance along the normal, mm^2; `None` where the slice thickness is not known.
+    /// Variance along the normal, mm^2; `None`: no blur along it.
     pub through_mm2: Option<f64>,
 }
 
@@ -30,7 +31,7 @@ impl Blur {
         Self {
             axes: [stack.row_direction, stack.column_direction, stack.normal()],
             in_slice_mm2: [column_step, row_step].map(|step| sigma_mm.powi(2) + step * step / 12.0),
-            through_mm2: stack.thickness_mm.map(|t| t * t / 12.0),
+            through_mm2: Some(stack.thickness_mm.unwrap_or(stack.slice_spacing_mm()).powi(2) / 12.0),
         }
     }
 

@@ -97,9 +97,12 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
         warnings.push(Warning::new("contours.psf_unknown", message, Place::none()));
     }
     let acquired = sigma_mm.map(|sigma| Blur::of(stack, sigma));
-    if acquired.is_some_and(|b| b.through_mm2.is_none()) {
-        let message = "the slice thickness is not known: what walls oblique to the slices lose through it (.1 to 2 % of \
-                       area) is not given back";
+    if acquired.is_some() && stack.thickness_mm.is_none() {
+        let spacing = stack.slice_spacing_mm();
+        let message = format!(
+            "the slice thickness is not known and was taken as the slices' distance, {spacing:.3} mm; where slices overlap \
+             or leave gaps, walls oblique to them err by .1 to 2 % of area"
+        );
         warnings.push(Warning::new("contours.thickness_unknown", message, Place::none()));
     }
     let mut curves = ctx.map_range(outlines.len(), |i| {
