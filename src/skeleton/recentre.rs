@@ -365,7 +365,13 @@ fn bridge(a: P3, b: P3, old: &[P3], lumen: &Lumen<'_>) -> Vec<P3> {
     (1..n).map(|i| a.lerp(b, i as f64 / n as f64)).collect()
 }
 
-fn measure_radii(graph: &mut MedialGraph, lines: Vec<Line>, lumen: &Lumen<'_>, ctx: &Ctx) -> Result<(), Error> {
+fn measure_radii(graph: &mut MedialGraph, mut lines: Vec<Line>, lumen: &Lumen<'_>, ctx: &Ctx) -> Result<(), Error> {
+    for line in &mut lines {
+        let inner = 1..line.points.len().saturating_sub(1);
+        for i in inner.filter(|&i| line.sections[i].is_none()) {
+            line.points[i] = lumen.inward(line.points[i]);
+        }
+    }
     let radii = ctx.map(&graph.nodes, |n| lumen.inscribed(n.position).unwrap_or(0.0))?;
     for (node, r) in graph.nodes.iter_mut().zip(radii) {
         node.radius_mm = r;
