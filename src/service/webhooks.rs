@@ -74,7 +74,7 @@ pub(crate) async fn target(config: &Config, url: &str) -> Result<(reqwest::Url, 
         return Err(refuse("it carries a user name or password"));
     }
     let port = parsed.port_or_known_default().ok_or_else(|| refuse("its scheme is not https"))?;
-    let trusted = config.webhook_hosts.iter().any(|name| *name == host);
+    let trusted = config.webhook_hosts.contains(&host);
     if parsed.scheme() != "https" && !(trusted && parsed.scheme() == "http") {
         return Err(refuse("its scheme is not https"));
     }

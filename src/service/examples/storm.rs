@@ -331,7 +331,7 @@ async fn settle(place: &Place, processes: &mut [Child], accepted: &BTreeMap<Stri
             ensure!(status.is_success(), "{name} of job {id}: {status} {}", String::from_utf8_lossy(&bytes));
             let digest = format!("sha256:{}", service::store::hex(&Sha256::digest(&bytes)));
             ensure!(artefact["digest"] == digest, "{name} of job {id} has digest {digest}: {artefact}");
-            let right = service::store::digest(&vec![*byte; 64]);
+            let right = service::store::digest(&[*byte; 64]);
             ensure!(String::from_utf8_lossy(&bytes).contains(&right), "job {id} holds another job's result");
             named.insert(format!("{id}/{name}"));
         }
