@@ -151,6 +151,7 @@ struct Server {
 
 impl Server {
     fn start(data: &Path) -> Self {
+        service::tls::provide();
         let mut process = Command::new(BINARY)
             .args(["serve", "--no-auth", "--listen", "127.0.0.1:0", "--data-dir", path(data)])
             .env("RUST_LOG", "error")
