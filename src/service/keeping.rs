@@ -17,17 +17,28 @@ use uuid::Uuid;
 const RETENTION: Duration = Duration::from_secs(60);
 /// Between sweeps of the store.
 const SWEEP: Duration = Duration::from_secs(3600);
+/// No upload is between its first object and its row for longer.
+const LONGEST_UPLOAD: Duration = Duration::from_secs(3600);
 /// Jobs erased in one go.
 const BATCH: i64 = 100;
 
-/// Sweeps at start and every hour, and erases what is past its time, until shutdown.
-pub(crate) async fn keep(queue: Queue, store: Store, config: Arc<Config>, shutdown: CancellationToken) {
-    let mut swept: Option<tokio::time::Instant> = None;
+/// Sweeps at start and every hour, and erases what is past its time, until shutdown. `start` is a moment before this
+/// process took its first request: an upload has its objects before it has its row, and must not be taken for an orphan.
+pub(crate) async fn keep(
+    queue: Queue,
+    store: Store,
+    config: Arc<Config>,
+    start: SystemTime,
+    shutdown: CancellationToken,
+) {
+    let grace = Duration::from_secs(config.sweep_seconds);
+    let first = if config.is_shared() { start.checked_sub(grace) } else { Some(start) };
+    sweep(&queue, &store, first).await;
+    let mut swept = tokio::time::Instant::now();
     while !shutdown.is_cancelled() {
-        if swept.is_none_or(|at| at.elapsed() >= SWEEP) {
-            let grace = if config.is_shared() { Duration::from_secs(config.sweep_seconds) } else { Duration::ZERO };
-            sweep(&queue, &store, grace).await;
-            swept = Some(tokio::time::Instant::now());
+        if swept.elapsed() >= SWEEP {
+            sweep(&queue, &store, SystemTime::now().checked_sub(grace.max(LONGEST_UPLOAD))).await;
+            swept = tokio::time::Instant::now();
         }
         if let Err(error) = retire(&queue, &store).await {
             tracing::warn!(%error, "retention waits");
@@ -55,9 +66,8 @@ async fn retire(queue: &Queue, store: &Store) -> anyhow::Result<()> {
 }
 
 /// Removes stored files that no job names. A job's age is that of its id (UUID v7).
-async fn sweep(queue: &Queue, store: &Store, grace: Duration) {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    let before = now.saturating_sub(grace).as_millis();
+async fn sweep(queue: &Queue, store: &Store, before: Option<SystemTime>) {
+    let before = before.and_then(|at| at.duration_since(UNIX_EPOCH).ok()).unwrap_or_default().as_millis();
     let stored = match store.jobs().await {
         Ok(jobs) => jobs,
         Err(error) => return tracing::warn!(%error, "cannot sweep the store"),
@@ -89,4 +99,30 @@ async fn sweep_attempts(queue: &Queue, store: &Store, job: Uuid) -> Result<(), c
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::db::Db;
+
+    #[tokio::test]
+    async fn an_upload_on_its_way_is_no_orphan_and_an_old_one_is() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let config = Config { data_dir: folder.path().to_owned(), ..Config::default() };
+        let queue = Queue::new(Db::open(&config).await.unwrap());
+        let store = Store::open(&config).unwrap();
+        let files = vec![("a".to_owned(), b"x".to_vec())];
+        let job = Uuid::now_v7();
+        store.put_input(job, &Store::describe(&files), files).await.unwrap();
+        let made = UNIX_EPOCH + Duration::from_millis(u64::try_from(made_ms(job)).unwrap());
+        sweep(&queue, &store, Some(made)).await;
+        assert_eq!(store.jobs().await.unwrap(), [job]);
+        // What a kill leaves between writing and renaming goes too.
+        std::fs::write(folder.path().join(format!("store/jobs/{job}/input/000001#1")), b"scan").unwrap();
+        sweep(&queue, &store, Some(made + Duration::from_millis(1))).await;
+        assert!(store.jobs().await.unwrap().is_empty());
+        assert!(!folder.path().join(format!("store/jobs/{job}")).exists());
+    }
 }

@@ -45,6 +45,7 @@ impl Server {
         if config.auth == Auth::None && !config.listen.ip().is_loopback() {
             bail!("refusing to serve {} without keys: leave out --no-auth, or listen on 127.0.0.1", config.listen);
         }
+        let begun = std::time::SystemTime::now();
         crate::tls::provide();
         let config = Arc::new(config);
         std::fs::create_dir_all(&config.data_dir)
@@ -65,7 +66,13 @@ impl Server {
             Auth::None => None,
         };
         let worker = parts.work(&config, &shutdown, &mut tasks).await?;
-        tasks.spawn(keeping::keep(parts.queue.clone(), parts.store.clone(), Arc::clone(&config), shutdown.clone()));
+        tasks.spawn(keeping::keep(
+            parts.queue.clone(),
+            parts.store.clone(),
+            Arc::clone(&config),
+            begun,
+            shutdown.clone(),
+        ));
         tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
         tasks.spawn(crate::webhooks::deliver(parts.queue.db().clone(), Arc::clone(&config), shutdown.clone()));
         let state = State {

@@ -308,7 +308,10 @@ async fn settle(place: &Place, processes: &mut [Child], accepted: &BTreeMap<Stri
         match job["state"].as_str() {
             Some("succeeded") => succeeded += 1,
             // Three of its starts met a kill.
-            Some("failed") if job["error"]["code"] == "job.crashed" => {
+            Some("failed")
+                if job["error"]["code"] == "job.crashed"
+                    && !job["error"]["detail"].to_string().contains("could not run it") =>
+            {
                 failed += 1;
                 continue;
             }
@@ -322,7 +325,10 @@ async fn settle(place: &Place, processes: &mut [Child], accepted: &BTreeMap<Stri
         let list = json(&client, &format!("{base}/artefacts")).await?;
         for artefact in list["items"].as_array().context("no artefacts")? {
             let name = artefact["name"].as_str().context("no name")?;
-            let bytes = client.get(format!("{base}/artefacts/{name}")).send().await?.bytes().await?;
+            let answer = client.get(format!("{base}/artefacts/{name}")).send().await?;
+            let status = answer.status();
+            let bytes = answer.bytes().await?;
+            ensure!(status.is_success(), "{name} of job {id}: {status} {}", String::from_utf8_lossy(&bytes));
             let digest = format!("sha256:{}", service::store::hex(&Sha256::digest(&bytes)));
             ensure!(artefact["digest"] == digest, "{name} of job {id} has digest {digest}: {artefact}");
             let right = service::store::digest(&[*byte; 64]);

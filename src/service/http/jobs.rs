@@ -199,14 +199,32 @@ async fn store_and_submit(
     input: &crate::store::Input,
     files: Vec<crate::config::NamedBytes>,
 ) -> Result<Submitted, Problem> {
-    let submitted = match state.store.put_input(job.id, input, files).await {
-        Ok(()) => state.queue.submit(job).await.map_err(Problem::from),
-        Err(error) => Err(error.into()),
-    };
-    if !matches!(submitted, Ok(Submitted::New(_))) {
-        state.store.erase_job(job.id).await?;
+    if let Err(error) = state.store.put_input(job.id, input, files).await {
+        // The sweep takes what a store that fails does not erase.
+        let _ = state.store.erase_job(job.id).await;
+        return Err(error.into());
     }
-    submitted
+    match state.queue.submit(job).await {
+        Ok(submitted @ Submitted::New(_)) => Ok(submitted),
+        Ok(other) => {
+            state.store.erase_job(job.id).await?;
+            Ok(other)
+        }
+        Err(error) => in_doubt(state, job, error).await,
+    }
+}
+
+/// A commit that answers with an error may have happened all the same: only a job that is certainly not in the table
+/// loses its input. When the table cannot be asked, the input stays; the sweep takes it if no row names it.
+async fn in_doubt(state: &State, job: &NewJob, error: sqlx::Error) -> Result<Submitted, Problem> {
+    match state.queue.job(&job.tenant, job.id).await {
+        Ok(Some(row)) => Ok(Submitted::New(row.into())),
+        Ok(None) => {
+            state.store.erase_job(job.id).await?;
+            Err(error.into())
+        }
+        Err(_) => Err(error.into()),
+    }
 }
 
 fn accepted(row: JobRow, waited: Option<Duration>, replayed: bool) -> Response {

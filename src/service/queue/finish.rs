@@ -57,7 +57,7 @@ fn out_of_memory(bound_mb: i64) -> Problem {
 }
 
 impl Queue {
-    /// Ends the hold. `None`: the lease was lost, nothing was written, the caller drops its files.
+    /// Ends the hold; asked again after it ended, it answers the state of then and writes nothing. `None`: the lease was lost, nothing was written, the caller drops its files.
     /// A success that meets a cancel becomes a cancel; the state that was reached is returned.
     ///
     /// # Errors
@@ -75,7 +75,7 @@ impl Queue {
 
 async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Result<Option<JobState>> {
     let held = "SELECT cancel_requested FROM job WHERE id = $1 AND fence = $2 AND state = 'running' FOR UPDATE";
-    let Some(row) = tx.row(held, args![&claim.id, claim.fence]).await? else { return Ok(None) };
+    let Some(row) = tx.row(held, args![&claim.id, claim.fence]).await? else { return already(tx, claim).await };
     let (state, error) = outcome(claim, closing, row.flag("cancel_requested")?);
     let end = "UPDATE job SET state = $3, error = $4, lease_owner = NULL, lease_until = NULL, eta_s = NULL, \
         progress = CASE WHEN $3 = 'succeeded' THEN 1 WHEN $3 = 'queued' THEN 0 ELSE progress END, \
@@ -107,6 +107,15 @@ async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Resu
         settle(tx, &claim.id).await?;
     }
     Ok(Some(state))
+}
+
+/// The state in which this very hold ended earlier, if it did. A commit whose answer was lost (the database stopped, the
+/// connection broke) is asked for again: it must not look like a lost lease, or the worker would drop files that the
+/// table names. The kill storm found that. Every claim and rescue raises the fence, so an equal fence is this hold's.
+async fn already(tx: &mut Tx<'_>, claim: &Claim) -> sqlx::Result<Option<JobState>> {
+    let ended = "SELECT state FROM job WHERE id = $1 AND fence = $2";
+    let row = tx.row(ended, args![&claim.id, claim.fence]).await?;
+    row.map(|row| JobState::of(row.get("state")?)).transpose()
 }
 
 /// What follows a final state, in its transaction: the end of the tenant's retention, and a message for each webhook.
