@@ -2,7 +2,7 @@
 
     cargo xtask bench surface     (or: SURFACES=FOLDER python tests/bench/surface.py after the survey example)
 
-Reads benchmark-raw.off, our meshes and times.csv from the folder. Peers: pymeshlab (isotropic explicit remeshing),
+Reads raw/benchmark.off, our meshes and times.csv from the folder. Peers: pymeshlab (isotropic explicit remeshing),
 pyacvd (clustering), mmgpy (mmgs). Distances are |f| / |grad f| of the analytic vessel at vertices and face centres.
 """
 
@@ -116,6 +116,6 @@ if __name__ == "__main__":
                 line("ours, " + name[10:], *off(name + ".off"), float(wall), float(cpu))
     for peer in (meshlab, acvd, mmg):
         try:
-            peer(off("benchmark-raw.off"))
+            peer(off("raw/benchmark.off"))
         except Exception as e:  # a peer that is not installed or fails is a line of the table, not its end
             print(f"{peer.__name__:<24} {type(e).__name__}: {e}")

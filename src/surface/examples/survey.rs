@@ -39,7 +39,9 @@ fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f
     let closed = if p.cuts.is_empty() { raw } else { cut(&raw, &p.field, &p.cuts, ctx)?.0 };
     ms[1] = t.elapsed().as_secs_f64() * 1e3;
     if let (true, Some(folder)) = (name.starts_with("benchmark"), std::env::args().nth(3)) {
-        std::fs::write(format!("{folder}/benchmark-raw.off"), off(&closed)).unwrap();
+        // In a folder of its own: what remeshers start from is not a surface to be judged.
+        std::fs::create_dir_all(format!("{folder}/raw")).unwrap();
+        std::fs::write(format!("{folder}/raw/benchmark.off"), off(&closed)).unwrap();
     }
     let (t, cpu) = (Instant::now(), cpu_s());
     let s = RemeshSettings { sizing, max_error_mm, ..RemeshSettings::default() };
