@@ -124,7 +124,7 @@ fn variants(wall: &Wall) -> Result<Vec<NamedBytes>, write::Error> {
 }
 
 /// Most constraints of a fit. Every value of f costs a sum over all of them: with the 36,000 of an aorta whose planes
-/// lie .9 mm apart the image of f takes five times as long as with 8,000, and its wall is the same (docs/adr/0022).
+/// lie .9 mm apart the image of f takes five times as long as with 8,000 (docs/adr/0022).
 const MOST_CONSTRAINTS: usize = 12_000;
 
 fn fit_settings() -> implicit::Settings {
@@ -206,29 +206,48 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         } else {
             break;
         };
-        let wall = mesh_of(&field, f, contours, plan, &ctx.part(0.3, 1.0))?;
-        let moved = wall.displacement.min_mm.abs().max(wall.displacement.max_mm.abs());
+        let shell = shell_of(&field, f, contours, plan, &ctx.part(0.3, 0.9))?;
+        let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            return Ok(wall);
+            return Ok(measured(shell, &field, plan, &ctx.part(0.9, 1.0))?);
         }
         limit = report.sigma_mm * RETREAT;
     }
-    mesh_of(&image.sampled, f, contours, plan, ctx)
+    let shell = shell_of(&image.sampled, f, contours, plan, &ctx.part(0.0, 0.9))?;
+    Ok(measured(shell, &image.sampled, plan, &ctx.part(0.9, 1.0))?)
 }
 
-fn mesh_of(field: &Sampled, f: &Variational, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+/// The capped and remeshed surface and how far it lies from the zero level of f as it was fitted.
+struct Shell {
+    mesh: TriMesh,
+    caps: Vec<surface::Cap>,
+    displacement: Displacement,
+}
+
+fn shell_of(
+    field: &Sampled,
+    f: &Variational,
+    contours: &Contours,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<Shell, surface::Error> {
     let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
     let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
     let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
     let mesh = remeshed(&cut, field, contours, plan, &ctx.part(0.2, 0.8))?;
-    let topology = surface::check(&mesh).map_err(surface::Error::from)?;
+    let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 1.0))?;
+    Ok(Shell { mesh, caps: report.caps, displacement })
+}
+
+fn measured(shell: Shell, field: &Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
+    let Shell { mesh, caps, displacement } = shell;
+    let topology = surface::check(&mesh)?;
     let quality = surface::quality(&mesh, field, ctx)?;
-    let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 0.95))?;
-    let ids: Vec<u32> = (0..report.caps.len() as u32).collect();
+    let ids: Vec<u32> = (0..caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
-    let (extended, warnings) = extended(&mesh, field, report.caps.len() as u32, plan, ctx)?;
-    let beside = beside(&mesh, &report.caps);
-    Ok(Wall { mesh, caps: report.caps, beside, topology, quality, displacement, patches, extended, warnings })
+    let (extended, warnings) = extended(&mesh, field, caps.len() as u32, plan, ctx)?;
+    let beside = beside(&mesh, &caps);
+    Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings })
 }
 
 /// Times that the shortest edge is halved where the wall is curved more sharply than it, as in the crotch of two arteries
