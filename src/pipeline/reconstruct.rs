@@ -224,6 +224,10 @@ struct Shell {
     displacement: Displacement,
 }
 
+/// Times that the polygoniser's cell is halved where it missed a turn of the wall, as between two arteries that part: the
+/// mesh then joins what f separates, or the reverse, and no remeshing can lay it on f.
+const HALVINGS: i32 = 2;
+
 fn shell_of(
     field: &Sampled,
     f: &Variational,
@@ -231,12 +235,22 @@ fn shell_of(
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<Shell, surface::Error> {
-    let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
-    let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
-    let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
-    let mesh = remeshed(&cut, field, contours, plan, &ctx.part(0.2, 0.8))?;
+    let by = |halvings: i32, ctx: &Ctx| {
+        let cell_mm = contours.pixel_mm * 0.5_f64.powi(halvings);
+        let cell = PolygoniseSettings { cell_mm, ..PolygoniseSettings::default() };
+        let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+        let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
+        Ok((remeshed(&cut, field, contours, plan, &ctx.part(0.2, 1.0))?, report.caps))
+    };
+    let mut meshed = by(0, &ctx.part(0.0, 0.8));
+    for halvings in 1..=HALVINGS {
+        if matches!(meshed, Err(surface::Error::Folded { .. })) {
+            meshed = by(halvings, &ctx.part(0.0, 0.8));
+        }
+    }
+    let (mesh, caps) = meshed?;
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 1.0))?;
-    Ok(Shell { mesh, caps: report.caps, displacement })
+    Ok(Shell { mesh, caps, displacement })
 }
 
 fn measured(shell: Shell, field: &Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
@@ -250,10 +264,6 @@ fn measured(shell: Shell, field: &Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wal
     Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings })
 }
 
-/// Times that the shortest edge is halved where the wall is curved more sharply than it, as in the crotch of two arteries
-/// that run side by side.
-const HALVINGS: i32 = 2;
-
 fn remeshed(
     cut: &TriMesh,
     field: &Sampled,
@@ -261,18 +271,13 @@ fn remeshed(
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<TriMesh, surface::Error> {
-    let [shortest, longest] = plan.surface.edge_mm;
-    let by = |halvings: i32| {
-        let settings = RemeshSettings {
-            edge_mm: [shortest * 0.5_f64.powi(halvings), longest],
-            max_error_mm: plan.surface.max_error_mm,
-            sizing: Sizing::Curvature,
-            ..RemeshSettings::default()
-        };
-        surface::remesh(cut, field, &contours.cuts, &settings, ctx).map(|(mesh, _)| mesh)
+    let settings = RemeshSettings {
+        edge_mm: plan.surface.edge_mm,
+        max_error_mm: plan.surface.max_error_mm,
+        sizing: Sizing::Curvature,
+        ..RemeshSettings::default()
     };
-    let folded = |mesh: &Result<TriMesh, surface::Error>| matches!(mesh, Err(surface::Error::Folded { .. }));
-    (1..=HALVINGS).fold(by(0), |mesh, halvings| if folded(&mesh) { by(halvings) } else { mesh })
+    surface::remesh(cut, field, &contours.cuts, &settings, ctx).map(|(mesh, _)| mesh)
 }
 
 /// Flow extensions at every cap. They are for solvers: where one has no room the numbers of the scan still stand, so
