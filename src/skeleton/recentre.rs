@@ -24,6 +24,9 @@ const SWELLING: f64 = 1.15;
 /// How far from a junction swelling is looked for, in the junction's inscribed radii: the lumens of a graft at 20 degrees
 /// part 5.7 radii out.
 const SWELLING_RADII: f64 = 8.0;
+/// Behind this length without swelling, in the same radii, the junction has ended: what swells farther out is a bump or
+/// the taper of the vessel itself.
+const CALM_RADII: f64 = 4.0;
 /// Length of the line through the centres next to a junction, in their radii. Short enough for bends of ten radii (.11
 /// radius off), long enough to average the ripple of a noisy wall.
 const AXIS_RADII: f64 = 3.0;
@@ -34,6 +37,17 @@ const PROXIMAL_STEPS: usize = 20;
 /// How far a junction may move to the crossing of the axes, in the largest radius of its branches: thinning puts it towards the crotch,
 /// 1.3 radii from the crossing for a graft at 45 degrees, 4.3 for one at 20 (the crotch itself lies 1 / tan 10 = 5.7 out).
 const JUNCTION_REACH_RADII: f64 = 6.0;
+/// And towards each junction that a line leads to, in the distance to it: two side branches of one trunk do not change
+/// places.
+const NEIGHBOUR_REACH: f64 = 0.4;
+/// The crossing has at least this share of the inscribed radius at the present place or of the second thickest branch's
+/// (a graft may be wider than its host), whichever is smaller: where the lines say little (three renal arteries in 30 mm of an aorta) it lies beside the trunk's axis.
+const KEPT_RADIUS: f64 = 0.8;
+/// A branch thinner than both others by this factor joins a vessel whose axis says where: the branch's own axis, carried
+/// on through a wide trunk, passes beside it.
+const SIDE_BRANCH: f64 = 2.0;
+/// Two branches whose radii differ by less than this factor, both thicker than the third, are one vessel that runs on.
+const SAME_VESSEL: f64 = 1.6;
 
 /// A trunk has at least this many times the radius of the wider of its branches; a vessel that runs on past a graft or
 /// a side branch keeps its radius, one that divides evenly by Murray's law has 1.26 times that of its branches.
@@ -97,7 +111,9 @@ fn starting_lines(graph: &MedialGraph, lumen: &Lumen<'_>, ctx: &Ctx) -> Result<V
         let mut points = resampled(&edge.points, lumen.spacing_mm());
         let half = half_window(radius, lumen);
         for _ in 0..2 {
-            points = averaged(&points, half);
+            let means = averaged(&points, half);
+            // a mean may cut through the wall between two lumens; the voxel line does not
+            points = points.iter().zip(means).map(|(&p, mean)| if lumen.contains(mean) { mean } else { p }).collect();
         }
         Line { sections: vec![None; points.len()], points, radius, closed }
     };
@@ -192,6 +208,9 @@ fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius
     // sections that are missing behind all others are open at a cap, not leaking at the junction
     let Some(outermost) = (0..n).rev().find(|&i| area(sections, i).is_some()) else { return };
     for i in (0..outermost).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
+        if from_end(i) > CALM_RADII * radius + last.map_or(0.0, from_end) {
+            break;
+        }
         let Some(a) = area(sections, i) else {
             last = Some(i);
             continue;
@@ -214,7 +233,8 @@ fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius
 /// Junctions to the point nearest to their branches' axes; free ends and the bases of closed lines to their centroids.
 fn place_nodes(graph: &mut MedialGraph, lines: &[Line], lumen: &Lumen<'_>) {
     let incidence = graph.incidence();
-    for (node, at) in graph.nodes.iter_mut().zip(&incidence) {
+    let neighbours = neighbours(graph);
+    for (n, (node, at)) in graph.nodes.iter_mut().zip(&incidence).enumerate() {
         let centre = |&(e, end): &(usize, usize)| {
             let sections = &lines[e].sections;
             let section = if end == 0 { sections.first() } else { sections.last() };
@@ -226,21 +246,68 @@ fn place_nodes(graph: &mut MedialGraph, lines: &[Line], lumen: &Lumen<'_>) {
             }
             continue;
         }
-        let axes: Vec<(P3, V3)> = at.iter().filter_map(|&(e, end)| axis(&lines[e], end)).collect();
-        if axes.len() < 2 {
-            continue;
-        }
-        let crossing = nearest_to_lines(&axes, node.position);
+        let mut radii: Vec<f64> = at.iter().map(|&(e, _)| lines[e].radius).collect();
+        radii.sort_by(|a, b| b.total_cmp(a));
+        let radius = radii[0];
         // a junction that thinning put into the crotch has a small sphere
-        let radius = at.iter().map(|&(e, _)| lines[e].radius).fold(node.radius_mm, f64::max);
-        let near = crossing.distance(node.position) <= JUNCTION_REACH_RADII * radius;
-        if near && lumen.contains(crossing) && lumen.sees(node.position, crossing) {
-            node.position = crossing;
+        let reach = JUNCTION_REACH_RADII * radius.max(node.radius_mm);
+        let deep = KEPT_RADIUS * lumen.inscribed(node.position).unwrap_or(0.0).min(*radii.get(1).unwrap_or(&radius));
+        let passes = |x: P3, to: V3| (x - node.position).dot(to) > NEIGHBOUR_REACH * to.length_squared();
+        let may = |x: P3| {
+            x.distance(node.position) <= reach
+                && neighbours[n].iter().all(|&q| !passes(x, q - node.position))
+                && lumen.contains(x)
+                && lumen.sees(node.position, x)
+                && lumen.inscribed(x).is_some_and(|r| r >= deep)
+        };
+        let axes: Vec<(P3, V3)> = at.iter().filter_map(|&(e, end)| axis(&lines[e], end)).collect();
+        let crossing = (axes.len() > 1).then(|| nearest_to_lines(&axes, node.position)).filter(|&x| may(x));
+        let foot = |from: P3, thinner: f64| on_trunk(from, at, lines, thinner).filter(|&x| may(x));
+        let placed = match crossing {
+            Some(x) => foot(x, SIDE_BRANCH).or(crossing),
+            None => foot(node.position, DIVIDED_RADIUS),
+        };
+        if let Some(x) = placed {
+            node.position = x;
         }
         if let Some(point) = division(node.position, at, lines, lumen) {
             node.position = point;
         }
     }
+}
+
+/// For each node the junctions to which a line leads.
+fn neighbours(graph: &MedialGraph) -> Vec<Vec<P3>> {
+    let mut of = vec![Vec::new(); graph.nodes.len()];
+    for edge in graph.edges.iter().filter(|e| !e.is_loop()) {
+        let [a, b] = edge.nodes;
+        for (from, to) in [(a, b), (b, a)] {
+            if graph.nodes[to].kind == NodeKind::Junction {
+                of[from].push(graph.nodes[to].position);
+            }
+        }
+    }
+    of
+}
+
+/// The foot of a side branch's junction on the straight line between the nearest good centres of the vessel that runs on,
+/// both of whose branches are `thinner` times as thick as the next.
+fn on_trunk(junction: P3, at: &[(usize, usize)], lines: &[Line], thinner: f64) -> Option<P3> {
+    let mut order = at.to_vec();
+    order.sort_by(|x, y| lines[y.0].radius.total_cmp(&lines[x.0].radius));
+    let &[first, second, third, ..] = order.as_slice() else { return None };
+    let radius = |branch: (usize, usize)| lines[branch.0].radius;
+    if first.0 == second.0 || radius(first) > SAME_VESSEL * radius(second) || radius(second) < thinner * radius(third) {
+        return None;
+    }
+    let next = |(e, end): (usize, usize)| {
+        let mut centres = lines[e].sections.iter().flatten().map(|s| s.centre);
+        if end == 0 { centres.next() } else { centres.next_back() }
+    };
+    let (a, b) = (next(first)?, next(second)?);
+    let along = b - a;
+    let t = (junction - a).dot(along) / along.length_squared();
+    (0.0..=1.0).contains(&t).then(|| a + along * t)
 }
 
 /// Where a trunk divides into two thinner branches, the axes may cross far upstream of the divider between them: in an

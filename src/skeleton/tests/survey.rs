@@ -139,3 +139,36 @@ fn drawn_anastomoses_at_every_resolution() {
     survey(0..100, &[128, 256]);
     survey(0..20, &[512]);
 }
+
+#[test]
+fn side_branches_close_together_keep_their_order_and_lie_on_the_trunk_s_axis() {
+    // an aorta with its visceral branches, tapering: their own axes, carried on through it, say little
+    for seed in 0..8 {
+        let mut draw = Draw(seed);
+        let at = |z: f64| P3::new(0.2, -0.1, z);
+        let trunk: Vec<(P3, P3, f64)> = (-10..10)
+            .map(|k| (at(6.0 * f64::from(k)), at(6.0 * f64::from(k + 1)), 7.0 - 0.08 * f64::from(k)))
+            .collect();
+        let heights = [-20.0, 0.0, 19.0].map(|z| z + draw.between(-2.0, 2.0));
+        let mut tubes = trunk;
+        for (k, z) in heights.into_iter().enumerate() {
+            let (azimuth, polar) = (2.2 * k as f64 + draw.between(-0.3, 0.3), draw.between(60.0, 110.0).to_radians());
+            let d = V3::new(polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos());
+            tubes.push((at(z), at(z) + d * 32.0, draw.between(1.5, 2.2)));
+        }
+        let mut vessel = Vessel::new(&tubes);
+        vessel.sharpness = 20.0;
+        let (cuts, caps): (Vec<_>, Vec<_>) =
+            [opening(1, at(45.0), V3::Z), opening(2, at(-45.0), -V3::Z)].into_iter().unzip();
+        let settings = Settings { spacing_mm: Some(0.6), ..Settings::default() };
+        let (graph, _) = medial_graph(&vessel, &cuts, &caps, &[at(0.0)], &settings, &Ctx::new(2).unwrap()).unwrap();
+        assert_eq!(counts(&graph), (5, 3, 0, 1), "seed {seed}");
+        let mut junctions: Vec<P3> =
+            graph.nodes.iter().filter(|n| n.kind == NodeKind::Junction).map(|n| n.position).collect();
+        junctions.sort_by(|a, b| a.z().total_cmp(&b.z()));
+        for (p, z) in junctions.iter().zip(heights) {
+            assert!(p.distance(at(p.z())) < 0.7, "seed {seed}: {p:?}");
+            assert!((p.z() - z).abs() < 3.0, "seed {seed}: {p:?} instead of {z}");
+        }
+    }
+}
