@@ -90,7 +90,7 @@ impl Varied {
         let direction = |tracks: &[Track], leg: usize| {
             let ([from, to], fit) = &axes.windows[leg];
             fit.line?;
-            let samples = leg_samples(&tracks[legs[leg].track], legs[leg], axes.origin, axes.crotch);
+            let samples = leg_samples(tracks, legs[leg], axes.origin, axes.crotch);
             fit_window(&samples, *from, *to, 0.0).line.map(|l| l.direction)
         };
         self.tracks.iter().map(|tracks| (0..legs.len()).map(|leg| direction(tracks, leg)).collect()).collect()

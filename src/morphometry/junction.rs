@@ -59,10 +59,63 @@ pub fn crotch_distance(angle: f64, radius_a_mm: f64, radius_b_mm: f64) -> f64 {
     }
 }
 
+/// A vessel runs on past side branches thinner than it by this factor, and itself changes by less than this.
+const SIDE_BRANCH: f64 = 1.6;
+/// And bends by less than 45 degrees there.
+const STRAIGHT_ON: f64 = std::f64::consts::FRAC_1_SQRT_2;
+/// Most branches that one leg is followed through: an aorta has four side branches in the reach of a window.
+const PIECES: usize = 6;
+
+/// A leg and what continues it past thin side branches, which end no vessel: an iliac artery with a lumbar branch 15 mm
+/// from the aortic bifurcation is straight far beyond.
+fn pieces(tracks: &[Track], leg: Leg) -> Vec<Leg> {
+    let mut pieces = vec![leg];
+    while let Some(next) =
+        onward(tracks, pieces[pieces.len() - 1]).filter(|n| pieces.iter().all(|p| p.track != n.track))
+    {
+        pieces.push(next);
+        if pieces.len() == PIECES {
+            break;
+        }
+    }
+    pieces
+}
+
+fn onward(tracks: &[Track], leg: Leg) -> Option<Leg> {
+    let track = &tracks[leg.track];
+    let node = if leg.reversed { track.from_node } else { track.to_node };
+    let mut others: Vec<Leg> = legs_at(tracks, node).into_iter().filter(|l| l.track != leg.track).collect();
+    let radius = |l: &Leg| tracks[l.track].radius();
+    others.sort_by(|a, b| radius(b).total_cmp(&radius(a)));
+    let (next, side) = (others.first().copied()?, others.get(1)?);
+    let (own, on) = (track.radius(), radius(&next));
+    let alike = own.max(on) < SIDE_BRANCH * own.min(on);
+    let straight = tangent_at(track, leg, End::Far)?.dot(tangent_at(&tracks[next.track], next, End::Near)?);
+    (alike && SIDE_BRANCH * radius(side) < own.min(on) && straight > STRAIGHT_ON).then_some(next)
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum End {
+    Near,
+    Far,
+}
+
+/// Direction away from the junction at one end of a leg: of the chord over two radii.
+fn tangent_at(track: &Track, leg: Leg, end: End) -> Option<V3> {
+    let (length, reach) = (track.length(), (2.0 * track.radius()).min(track.length()));
+    let from_start = (end == End::Near) != leg.reversed;
+    let within = |s: f64| if from_start { s <= reach } else { s >= length - reach };
+    let mut points = track.sections.iter().filter(|s| within(s.abscissa_mm)).map(|s| s.position);
+    let first = points.next()?;
+    let chord = (points.next_back()? - first).normalised()?;
+    Some(if leg.reversed { -chord } else { chord })
+}
+
 /// A sample of a leg.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LegSample {
-    /// Its number on the track.
+    /// Its track, and its number on it.
+    pub(crate) track: usize,
     pub(crate) index: usize,
     /// Distance along the branch from the meeting point, and half the length it stands for, mm.
     pub(crate) distance: f64,
@@ -71,18 +124,24 @@ pub(crate) struct LegSample {
     pub(crate) usable: bool,
 }
 
-/// A leg's samples, from the junction outward. Distance is straight within `inner` of `origin`, and along the line from
-/// where it leaves that sphere.
-pub(crate) fn leg_samples(track: &Track, leg: Leg, origin: DVec3, inner: f64) -> Vec<LegSample> {
-    let n = track.sections.len();
-    let length = track.length();
-    let order = (0..n).map(|i| if leg.reversed { n - 1 - i } else { i });
-    let items: Vec<(usize, f64, DVec3)> = order
-        .map(|k| {
+/// A leg's samples, from the junction outward and on past thin side branches. Distance is straight within `inner` of
+/// `origin`, and along the line from where it leaves that sphere.
+pub(crate) fn leg_samples(tracks: &[Track], leg: Leg, origin: DVec3, inner: f64) -> Vec<LegSample> {
+    let mut items: Vec<([usize; 2], f64, DVec3)> = Vec::new();
+    let mut before = 0.0;
+    for piece in pieces(tracks, leg) {
+        let (track, length) = (&tracks[piece.track], tracks[piece.track].length());
+        let count = track.sections.len();
+        // the first section of a piece is the last of the one before it
+        for i in usize::from(before > 0.0)..count {
+            let k = if piece.reversed { count - 1 - i } else { i };
             let s = &track.sections[k];
-            (k, if leg.reversed { length - s.abscissa_mm } else { s.abscissa_mm }, s.position.raw())
-        })
-        .collect();
+            let along = if piece.reversed { length - s.abscissa_mm } else { s.abscissa_mm };
+            items.push(([piece.track, k], before + along, s.position.raw()));
+        }
+        before += length;
+    }
+    let n = items.len();
     let straight = |i: usize| items[i].2.distance(origin);
     let first = (0..n).find(|&i| straight(i) > inner).unwrap_or(n - 1);
     let start = if first == 0 {
@@ -94,11 +153,11 @@ pub(crate) fn leg_samples(track: &Track, leg: Leg, origin: DVec3, inner: f64) ->
     };
     (0..n)
         .map(|i| {
-            let (index, s, point) = items[i];
+            let ([track, index], s, point) = items[i];
             let distance = if i < first { straight(i) } else { s - start };
             let (before, after) = (items[i.saturating_sub(1)].1, items[(i + 1).min(n - 1)].1);
             let half = 0.25 * (after - before) * if i == 0 || i == n - 1 { 2.0 } else { 1.0 };
-            LegSample { index, distance, half, point, usable: track.usable(index) }
+            LegSample { track, index, distance, half, point, usable: tracks[track].usable(index) }
         })
         .collect()
 }
@@ -220,7 +279,7 @@ fn turn_of(tracks: &[Track], legs: &[Leg], radii: &[f64], axes: &Axes, ruler: Ru
     let mut windows = Vec::with_capacity(legs.len());
     let mut directions = Vec::with_capacity(legs.len());
     for (&leg, &radius) in legs.iter().zip(radii) {
-        let samples = leg_samples(&tracks[leg.track], leg, axes.origin, axes.crotch);
+        let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
         let (diameter, user_from, user_to) = match ruler {
             Ruler::Own { to } => (2.0 * radius, 0.0, to),
             Ruler::Shared { diameter, from, to } => (diameter, from, to),
@@ -250,9 +309,9 @@ fn turn_of(tracks: &[Track], legs: &[Leg], radii: &[f64], axes: &Axes, ruler: Ru
 /// Flags the sections of a leg that lie within the crotch distance.
 pub(crate) fn flag(tracks: &mut [Track], legs: &[Leg], axes: &Axes) {
     for &leg in legs {
-        let samples = leg_samples(&tracks[leg.track], leg, axes.origin, axes.crotch);
+        let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
         for s in samples.iter().filter(|s| s.distance < axes.crotch) {
-            tracks[leg.track].sections[s.index].in_junction = true;
+            tracks[s.track].sections[s.index].in_junction = true;
         }
     }
 }

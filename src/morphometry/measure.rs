@@ -202,7 +202,7 @@ fn rough_directions(tracks: &[Track], place: &Spot, axes: &Axes) -> Vec<Option<V
         .map(|(i, &leg)| {
             axes.direction(i).or_else(|| {
                 let track = &tracks[leg.track];
-                let samples = leg_samples(track, leg, axes.origin, axes.crotch);
+                let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
                 chord(&samples, axes.origin, leg_radius(track, leg, place.radius))
             })
         })
@@ -285,12 +285,8 @@ impl Site<'_> {
     /// Lines of all legs for windows that end at each distance of the grid.
     fn curves(&self) -> (Vec<f64>, Vec<Vec<Option<FittedLine>>>) {
         let from = self.axes.windows.first().map_or(0.0, |w| w.0[0]);
-        let samples: Vec<_> = self
-            .place
-            .legs
-            .iter()
-            .map(|&l| leg_samples(&self.tracks[l.track], l, self.axes.origin, self.axes.crotch))
-            .collect();
+        let samples: Vec<_> =
+            self.place.legs.iter().map(|&l| leg_samples(self.tracks, l, self.axes.origin, self.axes.crotch)).collect();
         let end = |leg: usize| {
             samples[leg].iter().filter(|s| s.usable).map(|s| s.distance).fold(0.0, f64::max) / self.diameter
         };

@@ -532,3 +532,32 @@ fn shape_narrowing_and_kind_of_curve_are_told() {
         assert!(curve.residual_mm.iter().flatten().all(|r| *r < 0.01), "{}: {:?}", a.name, curve.residual_mm);
     }
 }
+
+#[test]
+fn a_thin_side_branch_near_a_junction_ends_no_window() {
+    let whole = anastomosis(45.0, 12.0, [2.5, 3.0, 3.0], 0.0);
+    let expected = run(&whole, points(&whole, [true; 3])).unwrap();
+    let mut case = anastomosis(45.0, 12.0, [2.5, 3.0, 3.0], 0.0);
+    let roles = points(&case, [true; 3]);
+    // the proximal vessel gives off a branch of .8 mm 12 mm from the junction: alone it is too short for a window
+    let (split, outward) = (40, DVec3::new(-0.3, 1.0, 0.3).normalize());
+    let edge = &mut case.graph.edges[1];
+    let far = edge.points.split_off(split);
+    let at = edge.points[split - 1];
+    let [near_end, far_end] = [edge.nodes[0], edge.nodes[1]];
+    let middle = case.graph.nodes.len();
+    case.graph.nodes.push(node(NodeKind::Junction, at.raw(), 3.0));
+    case.graph.edges[1].nodes = [near_end, middle];
+    case.graph.edges[1].radius_mm = vec![3.0; split];
+    let rest: Vec<P3> = std::iter::once(at).chain(far).collect();
+    case.graph.edges.push(Edge { nodes: [middle, far_end], radius_mm: vec![3.0; rest.len()], points: rest });
+    case.field.0.push((vec![at.raw(), at.raw() + outward * 14.0], 0.8));
+    let twig: Vec<DVec3> = (0..=40).map(|k| at.raw() + outward * (0.3 * k as f64)).collect();
+    add(&mut case.graph, middle, &twig, 0.8);
+    let m = run(&case, Roles { proximal: Some(at), ..roles }).unwrap();
+    let (j, wanted) = (m.junctions.iter().find(|j| j.node == 0).unwrap(), &expected.junctions[0]);
+    for a in &wanted.angles {
+        let value = angle(j, &a.name).unwrap_or_else(|| panic!("{}: {:?}", a.name, m.warnings));
+        assert!((value - a.value_deg.unwrap()).abs() < 0.1, "{}: {value} for {:?}", a.name, a.value_deg);
+    }
+}
