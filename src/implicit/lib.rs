@@ -11,6 +11,7 @@ mod ensemble;
 mod error;
 mod field;
 mod fit;
+mod hierarchy;
 mod interpolate;
 mod kernel;
 mod nearest;

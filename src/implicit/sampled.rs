@@ -46,14 +46,8 @@ impl Sampled {
         let grid = lattice(wall, settings)?;
         let mut values = coarse_values(field, &grid, ctx)?;
         let near = near_points(&grid, wall, settings);
-        let exact = ctx.map_range(near.len().div_ceil(256), |chunk| {
-            let part = &near[chunk * 256..near.len().min((chunk + 1) * 256)];
-            let points: Vec<P3> = part.iter().map(|&i| position(&grid, i)).collect();
-            let mut out = vec![0.0; points.len()];
-            field.values(&points, &mut out);
-            out
-        })?;
-        for (&i, v) in near.iter().zip(exact.into_iter().flatten()) {
+        let points: Vec<P3> = near.iter().map(|&i| position(&grid, i)).collect();
+        for (&i, v) in near.iter().zip(field.values_of_many(&points, ctx)?) {
             values[i] = v;
         }
         for axis in 0..3 {
@@ -203,14 +197,11 @@ fn position(grid: &Grid, index: usize) -> P3 {
 /// All lattice values by trilinear interpolation of every fourth one.
 fn coarse_values(field: &dyn Field, grid: &Grid, ctx: &Ctx) -> Result<Vec<f64>, Error> {
     let n = grid.size.map(|n| (n - 1) / COARSE + 1);
-    let rows = ctx.map_range(n[1] * n[2], |row| {
-        let (j, k) = (row % n[1] * COARSE, row / n[1] * COARSE);
-        let points: Vec<P3> = (0..n[0]).map(|i| grid.point(i * COARSE, j, k)).collect();
-        let mut out = vec![0.0; points.len()];
-        field.values(&points, &mut out);
-        out
-    })?;
-    let coarse = |i: usize, j: usize, k: usize| rows[j + n[1] * k][i];
+    let points: Vec<P3> = (0..n[0] * n[1] * n[2])
+        .map(|at| grid.point(at % n[0] * COARSE, at / n[0] % n[1] * COARSE, at / (n[0] * n[1]) * COARSE))
+        .collect();
+    let knots = field.values_of_many(&points, ctx)?;
+    let coarse = |i: usize, j: usize, k: usize| knots[i + n[0] * (j + n[1] * k)];
     let mut values = vec![0.0; grid.len()];
     let cell = |i: usize, n: usize| {
         let c = (i / COARSE).min(n - 2);
