@@ -1,7 +1,7 @@
 //! The fitted function: a sum over the cubic kernel, a linear polynomial, and the points that it came from.
 
 use crate::conjugate::Solution;
-use crate::hierarchy::{self, Fineness};
+use crate::hierarchy;
 use crate::kernel::Centres;
 use crate::system::Scale;
 use crate::{Error, Field};
@@ -59,7 +59,7 @@ impl Field for Variational {
     }
     fn values_of_many(&self, xs: &[P3], ctx: &Ctx) -> Result<Vec<f64>, Cancelled> {
         let targets: Vec<[f64; 3]> = xs.iter().map(|&x| self.scale.apply(x)).collect();
-        let mut out = hierarchy::sums(&self.centres, &targets, Fineness::default(), ctx)?;
+        let mut out = hierarchy::sums(&self.centres, &targets, ctx)?;
         for (o, t) in out.iter_mut().zip(&targets) {
             *o += self.linear(*t);
         }
