@@ -10,6 +10,7 @@ mod contrasts;
 mod ensemble;
 mod error;
 mod field;
+mod filter;
 mod fit;
 mod hierarchy;
 mod interpolate;
