@@ -29,6 +29,9 @@ pub(crate) struct Solution {
     pub(crate) condition: f64,
 }
 
+/// Coefficients c and polynomial b.
+pub(crate) type Coefficients = (Vec<f64>, [f64; 4]);
+
 /// The system with its preconditioner.
 pub(crate) struct Iterative<'a> {
     points: &'a [[f64; 3]],
@@ -58,15 +61,14 @@ impl<'a> Iterative<'a> {
         let mut errors = y.to_vec();
         let mut iterations = 0;
         for round in 1..=ROUNDS {
-            let (step, count) = self.round(&errors, 0.5 * tolerance, ctx)?;
+            let ([step], count) = self.descent([&errors], 0.5 * tolerance, ctx)?;
             iterations += count;
             c.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
             // the side conditions drift by rounding: put c back into the null space
             c = self.reflections.projected(&c).0;
             let left = residual(self.points, self.noise, y, (&c, &[0.0; 4]), ctx)?;
             let b = self.reflections.polynomial(self.reflections.projected(&left).1);
-            errors =
-                left.iter().zip(self.points).map(|(l, p)| l - b[0] - b[1] * p[0] - b[2] * p[1] - b[3] * p[2]).collect();
+            errors = self.less_polynomial(&left, &b);
             if largest(&errors) <= if round == ROUNDS { limit } else { tolerance } {
                 let condition = self.condition(ctx)?;
                 return Ok(Solution { coefficients: c, polynomial: b, errors, iterations, condition });
@@ -75,36 +77,66 @@ impl<'a> Iterative<'a> {
         Err(Error::Stalled { constraints: n, iterations, residual_mm: largest(&errors), wanted_mm: limit })
     }
 
-    /// Conjugate gradients for right-hand side `y` from zero, until the recursion's residual is small or the iterations
-    /// are used up.
-    fn round(&self, y: &[f64], tolerance: f64, ctx: &Ctx) -> Result<(Vec<f64>, usize), Error> {
-        let mut r = self.reflections.projected(y).0;
-        let start = largest(&r);
-        let mut c = vec![0.0; y.len()];
-        let mut p = vec![0.0; y.len()];
-        let mut before = 1.0;
+    /// Coefficients and polynomials for B right-hand sides to a residual of `tolerance`, at most `limit`, by descents that
+    /// share their products; the residual is one more shared product. Says nothing of the condition.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub(crate) fn solve_many<const B: usize>(
+        &self,
+        y: [&[f64]; B],
+        [tolerance, limit]: [f64; 2],
+        ctx: &Ctx,
+    ) -> Result<[Coefficients; B], Error> {
+        let (steps, _) = self.descent(y, 0.5 * tolerance, ctx)?;
+        let c = steps.map(|step| self.reflections.projected(&step).0);
+        let products = self.product.times(c.each_ref().map(Vec::as_slice), ctx)?;
+        let mut out = c.map(|c| (c, [0.0; 4]));
+        for ((y, product), out) in y.iter().zip(&products).zip(&mut out) {
+            let left: Vec<f64> = y.iter().zip(product).map(|(y, q)| y - q).collect();
+            out.1 = self.reflections.polynomial(self.reflections.projected(&left).1);
+            if largest(&self.less_polynomial(&left, &out.1)) > limit {
+                let again = self.solve(y, [tolerance, limit], ctx)?;
+                *out = (again.coefficients, again.polynomial);
+            }
+        }
+        Ok(out)
+    }
+
+    fn less_polynomial(&self, v: &[f64], b: &[f64; 4]) -> Vec<f64> {
+        v.iter().zip(self.points).map(|(v, p)| v - b[0] - b[1] * p[0] - b[2] * p[1] - b[3] * p[2]).collect()
+    }
+
+    /// Conjugate gradients for right-hand sides `y` from zero, until each one's recursion has a small residual or the
+    /// iterations are used up. Each is on its own but for the shared products.
+    fn descent<const B: usize>(
+        &self,
+        y: [&[f64]; B],
+        tolerance: f64,
+        ctx: &Ctx,
+    ) -> Result<([Vec<f64>; B], usize), Error> {
+        let mut runs = y.map(|y| Run::new(self.reflections.projected(y).0));
+        let start = runs.iter().fold(0.0_f64, |m, run| m.max(largest(&run.r)));
         for iteration in 0..MOST_ITERATIONS {
-            let now = largest(&r);
-            if now <= tolerance {
-                return Ok((c, iteration));
+            let mut now = 0.0_f64;
+            for run in runs.iter_mut().filter(|run| run.open) {
+                let size = largest(&run.r);
+                now = now.max(size);
+                run.open = size > tolerance;
+                if run.open {
+                    run.turn(&self.contrasts.apply(&run.r, ctx)?);
+                }
+            }
+            if runs.iter().all(|run| !run.open) {
+                return Ok((runs.map(|run| run.c), iteration));
             }
             ctx.progress((start / now).ln().max(0.0) / (start / tolerance).ln());
-            let z = self.contrasts.apply(&r, ctx)?;
-            let rz = dot(&r, &z);
-            let beta = if iteration == 0 { 0.0 } else { rz / before };
-            before = rz;
-            p.iter_mut().zip(&z).for_each(|(p, z)| *p = z + beta * *p);
-            let (q, _) = self.reflections.projected(&self.product.times(&p, ctx)?);
-            let pq = dot(&p, &q);
-            // rounding has eaten the descent: what is left is for the next round
-            if pq.is_nan() || pq <= 0.0 || rz <= 0.0 {
-                return Ok((c, iteration));
+            let products = self.product.times(runs.each_ref().map(|run| run.p.as_slice()), ctx)?;
+            for (run, product) in runs.iter_mut().zip(products).filter(|(run, _)| run.open) {
+                run.advance(&self.reflections.projected(&product).0);
             }
-            let alpha = rz / pq;
-            c.iter_mut().zip(&p).for_each(|(c, p)| *c += alpha * p);
-            r.iter_mut().zip(&q).for_each(|(r, q)| *r -= alpha * q);
         }
-        Ok((c, MOST_ITERATIONS))
+        Ok((runs.map(|run| run.c), MOST_ITERATIONS))
     }
 
     /// Largest eigenvalue by two products from a quadratic (the kernel's largest eigenvector is smooth), smallest by
@@ -116,7 +148,7 @@ impl<'a> Iterative<'a> {
             (v.iter().map(|x| x / length).collect::<Vec<f64>>(), length)
         };
         let (v, _) = unit(self.reflections.projected(&quadratic).0);
-        let (_, largest) = unit(self.reflections.projected(&self.product.times(&v, ctx)?).0);
+        let (_, largest) = unit(self.reflections.projected(&self.product.times([&v], ctx)?[0]).0);
         let mut v: Vec<f64> = (0..self.points.len()).map(|i| 1.0 + (i as f64 * 0.7).sin()).collect();
         let mut inverse = 0.0;
         for _ in 0..10 {
@@ -125,6 +157,43 @@ impl<'a> Iterative<'a> {
             inverse = dot(&v, &v).sqrt();
         }
         Ok(largest * inverse)
+    }
+}
+
+/// One right-hand side's conjugate gradients: solution, residual and direction.
+struct Run {
+    c: Vec<f64>,
+    r: Vec<f64>,
+    p: Vec<f64>,
+    /// r'z of this iteration.
+    rz: f64,
+    open: bool,
+}
+
+impl Run {
+    fn new(r: Vec<f64>) -> Self {
+        Self { c: vec![0.0; r.len()], p: vec![0.0; r.len()], rz: f64::INFINITY, open: true, r }
+    }
+
+    /// The next direction, from the preconditioned residual z.
+    fn turn(&mut self, z: &[f64]) {
+        let rz = dot(&self.r, z);
+        let beta = rz / self.rz;
+        self.rz = rz;
+        self.p.iter_mut().zip(z).for_each(|(p, z)| *p = z + beta * *p);
+    }
+
+    /// The step along the direction, whose product is q.
+    fn advance(&mut self, q: &[f64]) {
+        let pq = dot(&self.p, q);
+        // rounding has eaten the descent: what is left is for the next round
+        if pq.is_nan() || pq <= 0.0 || self.rz <= 0.0 {
+            self.open = false;
+            return;
+        }
+        let alpha = self.rz / pq;
+        self.c.iter_mut().zip(&self.p).for_each(|(c, p)| *c += alpha * p);
+        self.r.iter_mut().zip(q).for_each(|(r, q)| *r -= alpha * q);
     }
 }
 
@@ -208,6 +277,24 @@ mod tests {
             "{:?}",
             outcome.map(|s| s.iterations)
         );
+    }
+
+    #[test]
+    fn solutions_in_company_are_those_alone() {
+        let ctx = Ctx::new(2).unwrap();
+        let (points, noise, y) = vessel(1200, 0.3);
+        let other: Vec<f64> = points.iter().map(|p| (7.0 * p[0]).sin() + p[2]).collect();
+        let system = Iterative::new(&points, &noise, &ctx).unwrap();
+        let none = vec![0.0; y.len()];
+        let both = system.solve_many([&y, &none, &other], [1e-7; 2], &ctx).unwrap();
+        assert!(both[1].0.iter().all(|c| *c == 0.0));
+        for (y, (c, b)) in [(&y, &both[0]), (&other, &both[2])] {
+            let alone = system.solve(y, [1e-7; 2], &ctx).unwrap();
+            let worst = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+            let left = residual(&points, &noise, y, (c, b), &ctx).unwrap();
+            assert!(largest(&left) < 1.1e-7, "{:e}", largest(&left));
+            assert!(worst(c, &alone.coefficients) < 1e-3 * largest(&alone.coefficients));
+        }
     }
 
     #[test]

@@ -28,7 +28,10 @@ const WAVES: usize = 256;
 /// Smallest wave number, in scaled coordinates (the farthest constraint at distance 1): what is longer is as good as a
 /// polynomial of second degree, which the constraints determine.
 const WAVE_NUMBER_MIN: f64 = 0.5;
-/// Largest residual wanted and accepted of a draw, mm: bands are some hundredths of a mm wide.
+/// Largest residual wanted of a draw, as a share of the wall points' mean standard error: a band is about as wide as
+/// these, and its own scatter among 24 draws is 14 %.
+const DRAW_SHARE: f64 = 0.01;
+/// The least that is wanted, and what is accepted, mm.
 const DRAW_MM: [f64; 2] = [1e-4, 1e-3];
 /// Wall points from which their spacing is estimated.
 const SPACING_SAMPLES: usize = 64;
@@ -74,19 +77,30 @@ impl Ensemble {
     ) -> Result<Self, Error> {
         let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
         let longest = 2.0 * std::f64::consts::TAU / spacing(&points[..c.wall]).max(1e-4);
-        // the solver tells a progress of its own for every draw
-        let quiet = ctx.part(0.0, 0.0);
-        let draw = |number: usize| {
+        let fields = ctx.map_range(count, |number| {
             let mut normal = Normal::new(number as u64);
             let waves = waves(s, longest.max(2.0 * WAVE_NUMBER_MIN), &mut normal);
             let mut values = errors(c, &mut normal);
             for (v, p) in values.iter_mut().zip(&points) {
                 *v += sum(&waves, *p);
             }
-            let solution = solver.solve(&values, DRAW_MM, &quiet)?;
-            Ok(Draw { waves, centres: Centres::new(&points, &solution.coefficients), polynomial: solution.polynomial })
-        };
-        let draws = ctx.map_range(count, draw)?.into_iter().collect::<Result<Vec<_>, Error>>()?;
+            (waves, values)
+        })?;
+        let (waves, values): (Vec<Vec<Wave>>, Vec<Vec<f64>>) = fields.into_iter().unzip();
+        // the solver tells a progress of its own for every draw
+        let error = c.sigma_mm[..c.wall].iter().fold(0.0, |s, x| s + x) / c.wall.max(1) as f64;
+        let wanted = DRAW_MM[0].max(DRAW_SHARE * error);
+        let tolerance = [wanted, wanted.max(DRAW_MM[1])];
+        let solved = solver.solve_many(&values, tolerance, &ctx.part(0.0, 0.0))?;
+        let draws = waves
+            .into_iter()
+            .zip(solved)
+            .map(|(waves, (coefficients, polynomial))| Draw {
+                waves,
+                centres: Centres::new(&points, &coefficients),
+                polynomial,
+            })
+            .collect();
         Ok(Self { draws, scale: Some(scale) })
     }
 }
@@ -222,6 +236,54 @@ mod tests {
         }
         let ratio = sum_of_squares / f64::from(draws) / (2.0 * expected);
         assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
+    }
+
+    /// Seconds of the parts of a fit of 12,000 constraints with noise, for docs/adr/0024:
+    /// `cargo test --release -p implicit -- --ignored --nocapture time_of`.
+    #[test]
+    #[ignore = "half a minute of timing"]
+    fn time_of_a_fit_and_its_draws() {
+        use crate::interpolate::{Problem, solved};
+        let (rings, per_ring) = (150, 40);
+        let mut normal = Normal::new(5);
+        let (mut points, mut values) = (Vec::new(), Vec::new());
+        for depth in [0.0, 1.0] {
+            for i in 0..rings * per_ring {
+                let (ring, k) = (i / per_ring, i % per_ring);
+                let angle = std::f64::consts::TAU * k as f64 / per_ring as f64;
+                let (z, r) = (2.0 * ring as f64, 10.0 - depth + 0.1 * normal.next());
+                points.push(P3::new(r * angle.cos() + 0.001 * z * z, r * angle.sin(), z));
+                values.push(depth);
+            }
+        }
+        let n = points.len();
+        let c = Constraints {
+            points,
+            values,
+            sigma_mm: vec![0.1; n],
+            wall: n / 2,
+            interior: Vec::new(),
+            planar_shift: vec![None; n / 2],
+            curve: (0..n / 2).map(|i| Some(i / per_ring)).collect(),
+        };
+        let ctx = Ctx::new(2).unwrap();
+        let scale = Scale::of(&c.points);
+        let scaled: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
+        let clock = std::time::Instant::now;
+        let start = clock();
+        let s = crate::roughness::roughness(&c, &scaled, &scale, &ctx).unwrap();
+        println!("roughness {s:.3e}: {:.2} s", start.elapsed().as_secs_f64());
+        let noise: Vec<f64> = c.sigma_mm.iter().map(|e| e * e / s).collect();
+        let start = clock();
+        crate::contrasts::Contrasts::new(&scaled, &noise, &ctx).unwrap();
+        println!("contrasts: {:.2} s", start.elapsed().as_secs_f64());
+        let start = clock();
+        let problem = Problem { points: &scaled, noise: &noise, values: &c.values, tolerance: [1e-9, 1e-4] };
+        let (solution, solver) = solved(&problem, crate::Method::BySize, &ctx).unwrap();
+        println!("solve with contrasts: {} iterations, {:.2} s", solution.iterations, start.elapsed().as_secs_f64());
+        let start = clock();
+        Ensemble::new(&c, &solver, (scale, s), 24, &ctx).unwrap();
+        println!("24 draws: {:.2} s", start.elapsed().as_secs_f64());
     }
 
     #[test]

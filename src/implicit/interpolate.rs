@@ -1,6 +1,6 @@
 //! One linear system, solved by the method that fits its size; and the plain interpolant of scattered values.
 
-use crate::conjugate::{Iterative, Solution};
+use crate::conjugate::{Coefficients, Iterative, Solution};
 use crate::system::{Factor, Scale, residual};
 use crate::variational::Variational;
 use crate::{Error, Method};
@@ -11,6 +11,9 @@ use space::P3;
 const DENSE: usize = 1000;
 /// Up to here the dense factor (512 MB, 6 CPU-s) answers where conjugate gradients stall.
 const FALLBACK: usize = 8000;
+
+/// Right-hand sides that share products: with eight the sums no longer fit the registers.
+const TOGETHER: usize = 4;
 
 /// A system in scaled coordinates: (K + D) c + P b = y, P'c = 0.
 pub(crate) struct Problem<'a> {
@@ -47,6 +50,31 @@ impl<'a> Solver<'a> {
         match self {
             Self::Iterative(system) => system.solve(values, tolerance, ctx),
             Self::Dense { factor, points, noise } => refined(factor, points, (noise, values), ctx),
+        }
+    }
+
+    /// Coefficients and polynomials for many values y, [`TOGETHER`] at a time, in order.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(crate) fn solve_many(
+        &self,
+        values: &[Vec<f64>],
+        tolerance: [f64; 2],
+        ctx: &Ctx,
+    ) -> Result<Vec<Coefficients>, Error> {
+        match self {
+            Self::Iterative(system) => {
+                let none = vec![0.0; values.first().map_or(0, Vec::len)];
+                let together = |k: usize| {
+                    let y = std::array::from_fn(|b| values.get(k * TOGETHER + b).unwrap_or(&none).as_slice());
+                    system.solve_many::<TOGETHER>(y, tolerance, ctx)
+                };
+                let solved = ctx.map_range(values.len().div_ceil(TOGETHER), together)?;
+                let solved = solved.into_iter().collect::<Result<Vec<_>, Error>>()?;
+                Ok(solved.into_iter().flatten().take(values.len()).collect())
+            }
+            Self::Dense { factor, .. } => Ok(ctx.map(values, |y| factor.solve(y))?),
         }
     }
 }

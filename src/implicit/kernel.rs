@@ -16,6 +16,7 @@ pub(crate) struct Centres {
     y: Vec<[f64; LANES]>,
     z: Vec<[f64; LANES]>,
     c: Vec<[f64; LANES]>,
+    len: usize,
 }
 
 /// Value, gradient and second derivatives (xx, yy, zz, xy, xz, yz) of a sum.
@@ -30,12 +31,30 @@ impl Centres {
             y: vec![[0.0; LANES]; groups],
             z: vec![[0.0; LANES]; groups],
             c: vec![[0.0; LANES]; groups],
+            len: points.len(),
         };
         for (i, (p, &c)) in points.iter().zip(coefficients).enumerate() {
             let (g, l) = (i / LANES, i % LANES);
             (s.x[g][l], s.y[g][l], s.z[g][l], s.c[g][l]) = (p[0], p[1], p[2], c);
         }
         s
+    }
+
+    /// Number of centres.
+    pub(crate) fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Position and coefficient of a centre.
+    pub(crate) fn source(&self, i: usize) -> ([f64; 3], f64) {
+        let (g, l) = (i / LANES, i % LANES);
+        ([self.x[g][l], self.y[g][l], self.z[g][l]], self.c[g][l])
+    }
+
+    /// Some of the centres, in the order given.
+    pub(crate) fn some(&self, which: &[u32]) -> Self {
+        let (points, coefficients): (Vec<_>, Vec<_>) = which.iter().map(|&i| self.source(i as usize)).unzip();
+        Self::new(&points, &coefficients)
     }
 
     /// sum c_i r^3 at each target.

@@ -4,9 +4,11 @@
 //! are taken exactly in a band around the wall and interpolated from a lattice four times coarser elsewhere, where they
 //! only feed the tails of the Gaussian: 10 to 20 times fewer kernel sums than the full lattice.
 
+use crate::filter::{Rows, Spans, to_coefficients, twiced};
 use crate::{Error, Field};
 use exec::Ctx;
 use space::{Aabb, DMat3, DVec3, Grid, P3, Patient, V3};
+use std::sync::Arc;
 
 /// Lattice steps per coarse step.
 const COARSE: usize = 4;
@@ -34,7 +36,12 @@ pub struct Sampled {
     grid: Grid,
     origin: P3,
     spacing: f64,
-    coefficients: Vec<f64>,
+    /// Of the field as it was sampled, x fastest.
+    coefficients: Arc<Vec<f64>>,
+    /// Where samples are exact, by rows along x.
+    band: Arc<Spans>,
+    /// Coefficients that stand in the band instead.
+    smoothed: Option<Arc<Rows>>,
 }
 
 impl Sampled {
@@ -46,21 +53,14 @@ impl Sampled {
         let grid = lattice(wall, settings)?;
         let mut values = coarse_values(field, &grid, ctx)?;
         let near = near_points(&grid, wall, settings);
-        let exact = ctx.map_range(near.len().div_ceil(256), |chunk| {
-            let part = &near[chunk * 256..near.len().min((chunk + 1) * 256)];
-            let points: Vec<P3> = part.iter().map(|&i| position(&grid, i)).collect();
-            let mut out = vec![0.0; points.len()];
-            field.values(&points, &mut out);
-            out
-        })?;
-        for (&i, v) in near.iter().zip(exact.into_iter().flatten()) {
+        let points: Vec<P3> = near.iter().map(|&i| position(&grid, i)).collect();
+        for (&i, v) in near.iter().zip(field.values_of_many(&points, ctx)?) {
             values[i] = v;
         }
-        for axis in 0..3 {
-            along(&mut values, grid.size, axis, ctx, &|block, width| prefilter(block, width))?;
-        }
+        to_coefficients(&mut values, grid.size, ctx)?;
         let (origin, spacing) = (grid.point(0, 0, 0), settings.spacing_mm);
-        Ok(Self { grid, origin, spacing, coefficients: values })
+        let band = Arc::new(Spans::around(&near, grid.size));
+        Ok(Self { grid, origin, spacing, coefficients: Arc::new(values), band, smoothed: None })
     }
 
     /// The lattice.
@@ -68,29 +68,15 @@ impl Sampled {
         &self.grid
     }
 
-    /// This field smoothed by 2 G - G*G, G the Gaussian of standard deviation `sigma_mm` (see [`crate::smooth`]).
+    /// The field as it was sampled, smoothed by 2 G - G*G, G the Gaussian of standard deviation `sigma_mm` (see
+    /// [`crate::smooth`]). Only the band is smoothed: farther from the wall the image is coarse and guides no more.
     ///
     /// # Errors
     /// [`Error::Cancelled`].
     pub fn smoothed(&self, sigma_mm: f64, ctx: &Ctx) -> Result<Self, Error> {
         let t = (sigma_mm / self.spacing).powi(2);
-        let once = self.convolved(t, ctx)?;
-        let twice = self.convolved(2.0 * t, ctx)?;
-        let mut out = self.clone();
-        for ((o, a), b) in out.coefficients.iter_mut().zip(once).zip(twice) {
-            *o = 2.0 * a - b;
-        }
-        Ok(out)
-    }
-
-    /// Coefficients convolved with the discrete Gaussian of variance `t` (lattice steps squared).
-    fn convolved(&self, t: f64, ctx: &Ctx) -> Result<Vec<f64>, Error> {
-        let kernel = discrete_gaussian(t);
-        let mut data = self.coefficients.clone();
-        for axis in 0..3 {
-            along(&mut data, self.grid.size, axis, ctx, &|block, width| convolve(block, width, &kernel))?;
-        }
-        Ok(data)
+        let rows = twiced(&self.coefficients, self.grid.size, &self.band, t, ctx)?;
+        Ok(Self { smoothed: Some(Arc::new(rows)), ..self.clone() })
     }
 
     /// Lattice coordinates of a point moved into the lattice, and the distance moved, mm.
@@ -101,13 +87,20 @@ impl Sampled {
         (inside, (u - inside).length() * self.spacing)
     }
 
+    /// Four coefficients along x from (i, j, k).
+    #[inline]
+    fn four(&self, i: usize, j: usize, k: usize) -> &[f64] {
+        let row = j + self.grid.size[1] * k;
+        let at = i + self.grid.size[0] * row;
+        self.smoothed.as_ref().and_then(|s| s.four(row, i)).unwrap_or(&self.coefficients[at..at + 4])
+    }
+
     /// Sum over the 4 x 4 x 4 coefficients with the given weights per axis.
     fn weigh(&self, base: [usize; 3], wx: &[f64; 4], wy: &[f64; 4], wz: &[f64; 4]) -> f64 {
         let mut sum = 0.0;
         for (k, wz) in wz.iter().enumerate() {
             for (j, wy) in wy.iter().enumerate() {
-                let at = self.grid.index(base[0], base[1] + j, base[2] + k);
-                let c = &self.coefficients[at..at + 4];
+                let c = self.four(base[0], base[1] + j, base[2] + k);
                 sum += wz * wy * (wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2] + wx[3] * c[3]);
             }
         }
@@ -203,14 +196,11 @@ fn position(grid: &Grid, index: usize) -> P3 {
 /// All lattice values by trilinear interpolation of every fourth one.
 fn coarse_values(field: &dyn Field, grid: &Grid, ctx: &Ctx) -> Result<Vec<f64>, Error> {
     let n = grid.size.map(|n| (n - 1) / COARSE + 1);
-    let rows = ctx.map_range(n[1] * n[2], |row| {
-        let (j, k) = (row % n[1] * COARSE, row / n[1] * COARSE);
-        let points: Vec<P3> = (0..n[0]).map(|i| grid.point(i * COARSE, j, k)).collect();
-        let mut out = vec![0.0; points.len()];
-        field.values(&points, &mut out);
-        out
-    })?;
-    let coarse = |i: usize, j: usize, k: usize| rows[j + n[1] * k][i];
+    let points: Vec<P3> = (0..n[0] * n[1] * n[2])
+        .map(|at| grid.point(at % n[0] * COARSE, at / n[0] % n[1] * COARSE, at / (n[0] * n[1]) * COARSE))
+        .collect();
+    let knots = field.values_of_many(&points, ctx)?;
+    let coarse = |i: usize, j: usize, k: usize| knots[i + n[0] * (j + n[1] * k)];
     let mut values = vec![0.0; grid.len()];
     let cell = |i: usize, n: usize| {
         let c = (i / COARSE).min(n - 2);
@@ -259,124 +249,11 @@ fn near_points(grid: &Grid, wall: &[P3], settings: &SampledSettings) -> Vec<usiz
         .collect()
 }
 
-/// A filter on `width` interleaved lines: element l of line w lies at l * width + w.
-type LineFilter<'a> = &'a (dyn Fn(&mut [f64], usize) + Sync);
-
-/// Apply a line filter along one axis of a lattice, in parallel over the other axes.
-fn along(data: &mut [f64], size: [usize; 3], axis: usize, ctx: &Ctx, filter: LineFilter<'_>) -> Result<(), Error> {
-    let [nx, ny, nz] = size;
-    match axis {
-        0 => ctx.chunks_mut(data, nx, |_, line| filter(line, 1))?,
-        1 => ctx.chunks_mut(data, nx * ny, |_, slab| filter(slab, nx))?,
-        _ => {
-            let source = &*data;
-            let blocks = ctx.map_range(ny, |j| {
-                let mut block = Vec::with_capacity(nx * nz);
-                for k in 0..nz {
-                    block.extend_from_slice(&source[nx * (j + ny * k)..nx * (j + 1 + ny * k)]);
-                }
-                filter(&mut block, nx);
-                block
-            })?;
-            ctx.chunks_mut(data, nx, |first, line| {
-                let row = first / nx;
-                let (j, k) = (row % ny, row / ny);
-                line.copy_from_slice(&blocks[j][k * nx..(k + 1) * nx]);
-            })?;
-        }
-    }
-    Ok(())
-}
-
-/// Values to cubic B-spline coefficients along interleaved lines, mirrored at the ends (Unser 1993).
-fn prefilter(data: &mut [f64], width: usize) {
-    let pole = 3f64.sqrt() - 2.0;
-    let gain = (1.0 - pole) * (1.0 - 1.0 / pole);
-    let n = data.len() / width;
-    // the pole's powers fall below 1e-16 after 28 terms
-    let horizon = n.min(28);
-    let first: Vec<f64> =
-        (0..width).map(|w| (0..horizon).rev().fold(0.0, |s, l| s * pole + gain * data[l * width + w])).collect();
-    data.iter_mut().for_each(|x| *x *= gain);
-    data[..width].copy_from_slice(&first);
-    for l in 1..n {
-        let (before, rest) = data.split_at_mut(l * width);
-        for (x, b) in rest[..width].iter_mut().zip(&before[(l - 1) * width..]) {
-            *x += pole * b;
-        }
-    }
-    let scale = pole / (pole * pole - 1.0);
-    for w in 0..width {
-        let (a, b) = (data[(n - 1) * width + w], data[(n - 2) * width + w]);
-        data[(n - 1) * width + w] = scale * (a + pole * b);
-    }
-    for l in (0..n - 1).rev() {
-        let (before, rest) = data.split_at_mut((l + 1) * width);
-        for (x, a) in before[l * width..].iter_mut().zip(&rest[..width]) {
-            *x = pole * (a - *x);
-        }
-    }
-}
-
-/// The discrete Gaussian exp(-t) I_n(t) of variance t for n = 0.. (Lindeberg 1990): a semigroup on the lattice, so that
-/// smoothing twice by t is smoothing once by 2 t exactly, also for t below 1. Cut where it falls below 1e-12.
-fn discrete_gaussian(t: f64) -> Vec<f64> {
-    // downward recurrence I_{n-1} = I_{n+1} + 2 n / t I_n, normalised by I_0 + 2 sum I_n = exp(t)
-    if t < 1e-12 {
-        return vec![1.0];
-    }
-    let start = (20.0 + 12.0 * t.sqrt() + t) as usize;
-    let mut series = vec![0.0; start + 2];
-    series[start] = 1e-290;
-    for n in (1..=start).rev() {
-        series[n - 1] = series[n + 1] + 2.0 * n as f64 / t * series[n];
-        if series[n - 1] > 1e250 {
-            series.iter_mut().for_each(|x| *x *= 1e-250);
-        }
-    }
-    let total = series[0] + 2.0 * series[1..].iter().fold(0.0, |s, x| s + x);
-    series.iter_mut().for_each(|x| *x /= total);
-    let keep = series.iter().rposition(|&x| x > 1e-12).map_or(1, |n| n + 1);
-    series.truncate(keep);
-    series
-}
-
-/// Convolution of interleaved lines with a symmetric kernel, ends repeated.
-fn convolve(data: &mut [f64], width: usize, kernel: &[f64]) {
-    let n = data.len() / width;
-    let source = data.to_vec();
-    let row = |l: isize| {
-        let l = l.clamp(0, n as isize - 1) as usize;
-        &source[l * width..(l + 1) * width]
-    };
-    for l in 0..n {
-        let out = &mut data[l * width..(l + 1) * width];
-        out.iter_mut().zip(row(l as isize)).for_each(|(o, x)| *o = kernel[0] * x);
-        for (m, w) in kernel.iter().enumerate().skip(1) {
-            let (a, b) = (row(l as isize - m as isize), row(l as isize + m as isize));
-            for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
-                *o += w * (a + b);
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::test_fields::Cylinder;
-
-    #[test]
-    fn the_discrete_gaussian_has_mass_one_and_variance_t() {
-        for t in [0.01, 0.5, 3.0, 40.0] {
-            let g = discrete_gaussian(t);
-            let mass = g[0] + 2.0 * g[1..].iter().sum::<f64>();
-            let variance = 2.0 * g.iter().enumerate().map(|(n, w)| (n * n) as f64 * w).sum::<f64>();
-            assert!((mass - 1.0).abs() < 1e-9, "{t}: {mass}");
-            assert!((variance - t).abs() < 1e-7 * t.max(1.0), "{t}: {variance}");
-        }
-    }
 
     fn sampled(spacing_mm: f64) -> (Cylinder, Sampled) {
         let cylinder = Cylinder { radius: 3.0 };

@@ -51,7 +51,7 @@ pub struct SmoothReport {
 const AIM: f64 = 0.9;
 /// A displacement of at least this share of the aim ends the search: sigma is then within 6 % of the largest.
 const NEAR: f64 = 0.8;
-/// Most filters tried; each costs six passes over the lattice.
+/// Most filters tried; each costs six passes over the band (docs/adr/0024).
 const ATTEMPTS: usize = 8;
 /// Feet are sought within this many bounds.
 const REACH: f64 = 3.0;

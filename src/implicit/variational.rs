@@ -1,9 +1,11 @@
 //! The fitted function: a sum over the cubic kernel, a linear polynomial, and the points that it came from.
 
 use crate::conjugate::Solution;
+use crate::hierarchy;
 use crate::kernel::Centres;
 use crate::system::Scale;
 use crate::{Error, Field};
+use exec::{Cancelled, Ctx};
 use space::{Aabb, DMat3, DVec3, P3, Patient, V3};
 
 /// The fitted function with its constraints.
@@ -54,6 +56,14 @@ impl Field for Variational {
         for (o, t) in out.iter_mut().zip(&targets) {
             *o += self.linear(*t);
         }
+    }
+    fn values_of_many(&self, xs: &[P3], ctx: &Ctx) -> Result<Vec<f64>, Cancelled> {
+        let targets: Vec<[f64; 3]> = xs.iter().map(|&x| self.scale.apply(x)).collect();
+        let mut out = hierarchy::sums(&self.centres, &targets, ctx)?;
+        for (o, t) in out.iter_mut().zip(&targets) {
+            *o += self.linear(*t);
+        }
+        Ok(out)
     }
     fn bounds(&self) -> Aabb<Patient> {
         self.bounds
