@@ -22,7 +22,7 @@ pub trait Field: Sync {
         }
     }
     /// Values at many points, in parallel, in order: for lattices and clouds of 10^3 points and more. Fields that know how
-    /// share work between near points; the value of a point may then differ from [`Field::value`] by 1e-8 mm.
+    /// share work between near points; the value of a point may then differ from [`Field::value`] by 1e-7 mm (docs/adr/0023).
     ///
     /// # Errors
     /// [`Cancelled`].
