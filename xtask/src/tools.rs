@@ -26,6 +26,7 @@ const PYTHON_PACKAGES: &[&str] = &[
     "jsonschema<5",
     "PyYAML",
     "pymeshlab==2025.7.post1",
+    "schemathesis==4.32.5",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];

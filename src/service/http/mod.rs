@@ -1,6 +1,7 @@
 //! The network face: one router per resource, one layer that makes every error a problem, one place for headers.
 
 mod artefacts;
+mod describe;
 mod events;
 mod guard;
 mod health;
@@ -73,12 +74,15 @@ fn documented() -> OpenApiRouter<State> {
 
 /// The OpenAPI document of every documented route.
 pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
-    documented().into_openapi()
+    let mut document = documented().into_openapi();
+    describe::complete(&mut document);
+    document
 }
 
 /// The whole service as one router.
 pub(crate) fn router(state: State) -> Router {
-    let (api, document) = documented().split_for_parts();
+    let (api, mut document) = documented().split_for_parts();
+    describe::complete(&mut document);
     let document = Arc::new(document);
     let page = portal::router().layer(CompressionLayer::new());
     let described = Router::new()
