@@ -6,6 +6,7 @@ mod events;
 mod guard;
 mod health;
 mod jobs;
+mod listen;
 mod multipart;
 mod portal;
 pub(crate) mod problems;
@@ -15,6 +16,8 @@ mod shapes;
 mod stats;
 mod webhooks;
 mod workers;
+
+pub(crate) use listen::listen;
 
 use crate::state::State;
 use axum::Router;
@@ -96,6 +99,7 @@ pub(crate) fn router(state: State) -> Router {
             use axum::response::IntoResponse as _;
             crate::error::Problem::internal("a handler panicked").into_response()
         }))
+        .layer(from_fn(listen::paced))
         .layer(from_fn_with_state(state.clone(), guard::host))
         .layer(from_fn(guard::headers))
         .layer(from_fn(problems::layer))
