@@ -100,6 +100,7 @@ pub(crate) fn router(state: State) -> Router {
             crate::error::Problem::internal("a handler panicked").into_response()
         }))
         .layer(from_fn(listen::paced))
+        .layer(from_fn(guard::plain))
         .layer(from_fn_with_state(state.clone(), guard::host))
         .layer(from_fn(guard::headers))
         .layer(from_fn(problems::layer))

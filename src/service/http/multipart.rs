@@ -13,8 +13,8 @@ use tokio::sync::{OwnedSemaphorePermit, TryAcquireError};
 
 /// Most parts of one upload (4096 slices and some sidecars).
 const MOST_PARTS: usize = 8192;
-/// Largest plan, bytes: a position for each of 4096 slices is below 100 kB.
-const LARGEST_PLAN: usize = 1 << 20;
+/// Largest plan, bytes: a position for each of 4096 slices is below 100 kB; 1 MiB of nested lists took 70 MiB to read.
+pub(super) const LARGEST_PLAN: usize = 512 << 10;
 
 /// A read upload.
 #[derive(Debug)]
