@@ -100,7 +100,7 @@ struct Checked {
 #[allow(dead_code, reason = "describes the answer in the OpenAPI document")]
 enum Taken {
     /// The job.
-    Job(Job),
+    Job(Box<Job>),
     /// With `validate`.
     Checked(Checked),
 }
