@@ -75,9 +75,7 @@ async fn events(
     let (id, _) = job_of(&state, &who, &id).await?;
     let text = |name: &str| headers.get(name).and_then(|v| v.to_str().ok());
     let resumed = match headers.get("last-event-id") {
-        // A browser that has not seen an event yet may send an empty id.
         None => None,
-        Some(value) if value.is_empty() => None,
         Some(value) => Some(value.to_str().ok().and_then(|v| v.trim().parse().ok()).ok_or_else(|| {
             Problem::new(
                 StatusCode::BAD_REQUEST,

@@ -111,9 +111,12 @@ enum Taken {
         ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
     ),
-    request_body(content = SubmitForm, content_type = "multipart/form-data"),
+    request_body(content((SubmitForm = "multipart/form-data"), (super::uploads::FromUpload = "application/json"))),
     responses(
         (status = 202, description = "Accepted", body = Job),
+        (status = 404, description = "No such upload", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The upload is not whole yet", body = Problem, content_type = "application/problem+json"),
+        (status = 423, description = "A call is still sending to the upload", body = Problem, content_type = "application/problem+json"),
         (status = 200, description = "Ended within the wait, or the key was used before; with `validate`, what was read", body = Taken),
         (status = 400, description = "The upload is broken", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "A limit was met", body = Problem, content_type = "application/problem+json"),
@@ -134,9 +137,13 @@ async fn create(
         return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
     }
     let headers = request.headers().clone();
-    let form = form(&state, &who, request).await?;
     let key = idempotency_key(&headers)?;
-    let upload = multipart::read(&state, form).await?;
+    let (upload, resumable) = if names_upload(&headers) {
+        let (upload, id) = super::uploads::taken(&state, &who, request.into_body()).await?;
+        (upload, Some(id))
+    } else {
+        (multipart::read(&state, form(&state, &who, request).await?).await?, None)
+    };
     let files = intake(&state.config, upload.files).await?;
     let (input, files) =
         tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
@@ -176,9 +183,18 @@ async fn create(
     if !replayed {
         state.audit(&who, &trace.0, "job.create", &row.id).await?;
     }
+    if let Some(id) = resumable {
+        crate::uploads::used(state.queue.db(), &who.tenant, id).await?;
+    }
     let waited = preferred_wait(&headers);
     let row = wait(&state, &who, row, waited, |row| row.state.is_final()).await?;
     Ok(accepted(row, waited, replayed))
+}
+
+/// Whether the body is JSON that names a resumable upload.
+fn names_upload(headers: &HeaderMap) -> bool {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    kind.split(';').next().is_some_and(|kind| kind.trim().eq_ignore_ascii_case("application/json"))
 }
 
 /// The multipart body; a Content-Length beyond the limit is refused before a byte is read.

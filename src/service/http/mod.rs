@@ -14,6 +14,7 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod uploads;
 mod webhooks;
 mod workers;
 
@@ -66,6 +67,7 @@ impl utoipa::Modify for Keys {
 fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
+        .merge(uploads::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())

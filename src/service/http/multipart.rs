@@ -49,7 +49,7 @@ impl Budget {
     }
 
     /// Takes what `more` bytes need.
-    fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
+    pub(super) fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
         self.count(state, more)?;
         while (self.permits.len() as u64) * UPLOAD_UNIT < self.bytes {
             match state.uploads.clone().try_acquire_owned() {

@@ -7,7 +7,7 @@
 
 mod support;
 
-use reqwest::{Method, StatusCode};
+use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use service::auth::Role;
 use service::auth::keys::{self, NewKey};
@@ -50,6 +50,11 @@ const RULES: &[(&str, &str, Rule)] = &[
     ("POST", "/v1/jobs/{id}/cancel", Rule::Change),
     ("POST", "/v1/jobs/{id}/retry", Rule::Change),
     ("DELETE", "/v1/jobs/{id}", Rule::Change),
+    ("OPTIONS", "/v1/uploads", Rule::Open),
+    ("POST", "/v1/uploads", Rule::Change),
+    ("HEAD", "/v1/uploads/{id}", Rule::Read),
+    ("PATCH", "/v1/uploads/{id}", Rule::Change),
+    ("DELETE", "/v1/uploads/{id}", Rule::Change),
     ("GET", "/v1/webhooks", Rule::Read),
     ("POST", "/v1/webhooks", Rule::Change),
     ("DELETE", "/v1/webhooks/{id}", Rule::Change),
@@ -71,6 +76,7 @@ struct Ward {
     keys: BTreeMap<&'static str, String>,
     job: String,
     webhook: String,
+    upload: String,
     /// Texts that nobody else may read.
     secrets: Vec<String>,
 }
@@ -94,15 +100,33 @@ impl Ward {
         let webhook = made["id"].as_str().unwrap().to_owned();
         let ended = service.request(Method::GET, &format!("/v1/jobs/{job}?wait=15")).bearer_auth(&admin);
         assert_eq!(support::json(ended.send().await.unwrap()).await["state"], "succeeded");
-        let secrets = vec![job.clone(), webhook.clone(), url, made["secret"].as_str().unwrap().to_owned()];
-        Self { keys, job, webhook, secrets }
+        let begun = service.request(Method::POST, "/v1/uploads").bearer_auth(&admin).header("tus-resumable", "1.0.0");
+        let begun = begun.header("upload-length", "5").send().await.unwrap();
+        let upload = begun.headers()["location"].to_str().unwrap().rsplit('/').next().unwrap().to_owned();
+        let secrets =
+            vec![job.clone(), webhook.clone(), upload.clone(), url, made["secret"].as_str().unwrap().to_owned()];
+        Self { keys, job, webhook, upload, secrets }
     }
 
     /// The path with this tenant's things in it.
     fn path(&self, template: &str) -> String {
-        let id = if template.starts_with("/v1/webhooks/") { &self.webhook } else { &self.job };
+        let id = match template {
+            _ if template.starts_with("/v1/webhooks/") => &self.webhook,
+            _ if template.starts_with("/v1/uploads/") => &self.upload,
+            _ => &self.job,
+        };
         template.replace("{id}", id).replace("{name}", "result.json")
     }
+}
+
+/// A call with the headers without which an upload is not looked at.
+fn call(service: &Service, method: &Method, path: &str) -> RequestBuilder {
+    let request = service.request(method.clone(), path);
+    if !path.starts_with("/v1/uploads") {
+        return request;
+    }
+    let request = request.header("tus-resumable", "1.0.0").header("upload-offset", "0");
+    request.header("content-type", "application/offset+octet-stream")
 }
 
 async fn operations(service: &Service) -> Vec<(Method, String, Rule)> {
@@ -146,14 +170,16 @@ async fn every_operation_knows_its_roles_and_its_tenant() {
     let operations = operations(&service).await;
     for (method, template, rule) in &operations {
         let path = mine.path(template);
-        let nobody = service.request(method.clone(), &path).send().await.unwrap();
-        if *rule != Rule::Open {
+        let nobody = call(&service, method, &path).send().await.unwrap();
+        if *method == Method::HEAD {
+            assert_eq!(nobody.status(), StatusCode::UNAUTHORIZED, "{method} {template}");
+        } else if *rule != Rule::Open {
             assert_eq!(problem(nobody, 401).await, "auth.missing", "{method} {template}");
         }
         for role in ROLES {
             let what = format!("{method} {template} as {}", role.as_str());
             let key = &theirs.keys[role.as_str()];
-            let response = service.request(method.clone(), &path).bearer_auth(key).send().await.unwrap();
+            let response = call(&service, method, &path).bearer_auth(key).send().await.unwrap();
             let status = response.status();
             let text = response.text().await.unwrap();
             assert_silent(&text, &path, &mine, &what);
@@ -163,6 +189,10 @@ async fn every_operation_knows_its_roles_and_its_tenant() {
             }
         }
     }
+    // Another tenant's upload makes no job either.
+    let stolen = service.request(Method::POST, "/v1/jobs").bearer_auth(&theirs.keys["admin"]);
+    let stolen = stolen.json(&json!({"upload": mine.upload})).send().await.unwrap();
+    assert_eq!(problem(stolen, 404).await, "not_found");
     its_own_is_there(&service, &mine, &operations).await;
     service.stop().await;
 }
@@ -175,7 +205,7 @@ async fn its_own_is_there(service: &Service, mine: &Ward, operations: &[(Method,
     ordered.sort_by_key(|(method, _, _)| *method == Method::DELETE);
     for (method, template, rule) in ordered {
         for role in [Role::Auditor, Role::Read, Role::Upload, Role::Admin] {
-            let request = service.request(method.clone(), &mine.path(template)).bearer_auth(&mine.keys[role.as_str()]);
+            let request = call(service, method, &mine.path(template)).bearer_auth(&mine.keys[role.as_str()]);
             let status = request.send().await.unwrap().status();
             let what = format!("{method} {template} as {}: {status}", role.as_str());
             assert_eq!(status == StatusCode::FORBIDDEN, !may(*rule, role), "{what}");
