@@ -248,12 +248,15 @@ fn link() -> Vec<u8> {
     zip.finish().unwrap().into_inner()
 }
 
+/// Sends an attack; status and code of the answer.
+type Send = Box<dyn Fn(&Server) -> (u16, String)>;
+
 /// What an attack sends, and how it must be refused.
 struct Attack {
     name: &'static str,
     /// Bytes of the upload, MiB: memory that the client pays for.
     own_mib: u64,
-    send: Box<dyn Fn(&Server) -> (u16, String)>,
+    send: Send,
     status: u16,
     codes: &'static [&'static str],
 }

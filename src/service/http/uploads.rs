@@ -24,6 +24,8 @@ use utoipa_axum::routes;
 const VERSION: &str = "1.0.0";
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const PATCH_TYPE: &str = "application/offset+octet-stream";
+/// Most bytes of a refused body that are read.
+const DRAINED: usize = 16 << 20;
 /// The status of tus for a checksum that does not fit.
 const CHECKSUM_MISMATCH: u16 = 460;
 
@@ -180,26 +182,16 @@ async fn append(
     Path(id): Path<String>,
     request: Request,
 ) -> Result<Response, Problem> {
-    let headers = request.headers();
-    spoken(headers)?;
-    if headers.get(header::CONTENT_TYPE).is_none_or(|v| v != PATCH_TYPE) {
-        let detail = format!("Send the bytes as {PATCH_TYPE}.");
-        return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", detail));
-    }
-    let begin = number(headers, "upload-offset")?;
-    let check = promised(headers)?;
-    let (ticket, length) = known(&state, &who, &id).await?;
-    let mut partial = opened(&state, &ticket).await?;
-    if partial.offset != begin {
-        let detail = format!("The upload stands at {}, not at {begin}. HEAD tells the offset.", partial.offset);
-        return Err(Problem::new(StatusCode::CONFLICT, "upload.offset", detail));
-    }
-    if check.is_some() {
-        partial.on_trial();
-    }
+    let (parts, body) = request.into_parts();
+    let (partial, ticket, left, check) = match ready(&state, &who, &id, &parts.headers).await {
+        Ok(ready) => ready,
+        Err(problem) => {
+            drained(body).await;
+            return Err(problem);
+        }
+    };
     // A task of its own: it keeps what arrived though the connection's own task may be dropped at its end.
-    let left = length - begin.min(length);
-    let kept = tokio::spawn(received(partial, request.into_body(), left, check)).await.map_err(Problem::internal)?;
+    let kept = tokio::spawn(received(partial, body, left, check)).await.map_err(Problem::internal)?;
     let kept = kept?.to_string();
     let expires = expiry(&state, &who, &ticket).await?;
     Ok(answer(StatusCode::NO_CONTENT, &[("upload-offset", &kept), ("upload-expires", &expires)]))
@@ -230,6 +222,44 @@ async fn remove(
     }
     state.audit(&who, &trace.0, "upload.erase", &ticket.id.to_string()).await?;
     Ok(answer(StatusCode::NO_CONTENT, &[]))
+}
+
+/// The upload of a PATCH whose headers are in order, how much it lacks, and the checksum that was promised.
+async fn ready(
+    state: &State,
+    who: &Principal,
+    id: &str,
+    headers: &HeaderMap,
+) -> Result<(Partial, Ticket, u64, Option<Promise>), Problem> {
+    spoken(headers)?;
+    if headers.get(header::CONTENT_TYPE).is_none_or(|v| v != PATCH_TYPE) {
+        let detail = format!("Send the bytes as {PATCH_TYPE}.");
+        return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", detail));
+    }
+    let begin = number(headers, "upload-offset")?;
+    let check = promised(headers)?;
+    let (ticket, length) = known(state, who, id).await?;
+    let mut partial = opened(state, &ticket).await?;
+    if partial.offset != begin {
+        let detail = format!("The upload stands at {}, not at {begin}. HEAD tells the offset.", partial.offset);
+        return Err(Problem::new(StatusCode::CONFLICT, "upload.offset", detail));
+    }
+    if check.is_some() {
+        partial.on_trial();
+    }
+    Ok((partial, ticket, length - begin.min(length), check))
+}
+
+/// Reads and drops what a refused client is still sending: it would see a broken pipe instead of the answer.
+async fn drained(body: Body) {
+    let mut stream = body.into_data_stream();
+    let mut left = DRAINED;
+    while let Some(Ok(part)) = stream.next().await {
+        left = left.saturating_sub(part.len());
+        if left == 0 {
+            return;
+        }
+    }
 }
 
 /// A promised digest and its algorithm.

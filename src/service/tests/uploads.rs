@@ -206,3 +206,23 @@ async fn uploads_are_bounded_and_end() {
     assert_eq!(problem(many, 409).await, "upload.many");
     service.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn uploads_stand_on_postgresql_too() {
+    let cluster = tokio::task::spawn_blocking(support::postgres::cluster).await.unwrap();
+    let Some(cluster) = cluster else { return };
+    let url = cluster.database();
+    let service = Service::with(|config| {
+        config.database_url = Some(url);
+        config.workers = 0;
+    })
+    .await;
+    let path = create(&service, 5).await;
+    assert_eq!(patch(&service, &path, 0, b"abcde").send().await.unwrap().status(), 204);
+    assert_eq!(offset(&service, &path).await, 5);
+    let named = json!({"upload": path.rsplit('/').next().unwrap()});
+    assert_eq!(service.request(Method::POST, "/v1/jobs").json(&named).send().await.unwrap().status(), 202);
+    assert_eq!(call(&service, Method::DELETE, &path).send().await.unwrap().status(), 204);
+    assert_eq!(call(&service, Method::HEAD, &path).send().await.unwrap().status(), 404);
+    service.stop().await;
+}
