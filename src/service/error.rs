@@ -94,6 +94,15 @@ impl Problem {
         self
     }
 
+    /// The same with a status that has no name in HTTP itself.
+    #[must_use]
+    pub fn with_status(mut self, status: u16) -> Self {
+        self.status = status;
+        let named = StatusCode::from_u16(status).ok().and_then(|s| s.canonical_reason());
+        named.unwrap_or("Refused").clone_into(&mut self.title);
+        self
+    }
+
     /// The same with a header of the answer.
     #[must_use]
     pub fn with_header(mut self, name: &'static str, value: impl Into<String>) -> Self {

@@ -40,6 +40,9 @@ pub(crate) async fn keep(
             sweep(&queue, &store, SystemTime::now().checked_sub(grace.max(LONGEST_UPLOAD))).await;
             swept = tokio::time::Instant::now();
         }
+        if let Err(error) = crate::uploads::retire(queue.db(), &config.data_dir).await {
+            tracing::warn!(%error, "uploads past their time wait");
+        }
         if let Err(error) = retire(&queue, &store).await {
             tracing::warn!(%error, "retention waits");
         }

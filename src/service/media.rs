@@ -11,6 +11,15 @@ pub fn rfc3339(ms: i64) -> Option<String> {
     OffsetDateTime::from_unix_timestamp_nanos(i128::from(ms) * 1_000_000).ok()?.format(&Rfc3339).ok()
 }
 
+/// The HTTP date (RFC 9110) of ms since 1970; `None` beyond the calendar.
+pub fn http_date(ms: i64) -> Option<String> {
+    let at = OffsetDateTime::from_unix_timestamp(ms.div_euclid(1000)).ok()?;
+    let text = |word: &dyn std::fmt::Display| word.to_string().chars().take(3).collect::<String>();
+    let (day, month) = (text(&at.weekday()), text(&at.month()));
+    let (hour, minute, second) = at.to_hms();
+    Some(format!("{day}, {:02} {month} {:04} {hour:02}:{minute:02}:{second:02} GMT", at.day(), at.year()))
+}
+
 /// Ms since 1970 of a time of RFC 3339.
 pub fn ms_of(text: &str) -> Option<i64> {
     let time = OffsetDateTime::parse(text, &Rfc3339).ok()?;

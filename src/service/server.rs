@@ -86,14 +86,7 @@ impl Server {
             address,
         };
         let db = state.queue.db().clone();
-        let stop = shutdown.clone();
-        tasks.spawn(async move {
-            let served = axum::serve(listener, http::router(state))
-                .with_graceful_shutdown(async move { stop.cancelled().await });
-            if let Err(error) = served.await {
-                tracing::error!(%error, "the listener ended");
-            }
-        });
+        tasks.spawn(http::listen(listener, http::router(state), shutdown.clone()));
         std::fs::write(config.data_dir.join("listen"), format!("http://{address}\n"))?;
         Ok(Self { address, first_key, shutdown, tasks, db, _lock: lock })
     }

@@ -67,6 +67,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     survey.arg(&surfaces);
     shell::run(survey)?;
     let python = tools::python()?;
+    tools::deploy()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge

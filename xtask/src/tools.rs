@@ -26,10 +26,13 @@ const PYTHON_PACKAGES: &[&str] = &[
     "jsonschema<5",
     "PyYAML",
     "pymeshlab==2025.7.post1",
+    "schemathesis==4.32.5",
+    "kubernetes-validate==1.37.0",
+    "podman-compose==1.6.0",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
-const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1"];
+const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1", "tus-js-client@4.3.1"];
 
 /// Build the release binary (with the portal) and give its path.
 pub(crate) fn release_binary() -> Result<PathBuf> {
@@ -85,6 +88,14 @@ pub(crate) fn postgres() -> Result<()> {
         return Ok(());
     }
     apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
+}
+
+/// Programs that read the files of deploy/.
+pub(crate) fn deploy() -> Result<()> {
+    if shell::has("promtool") && PathBuf::from("/usr/sbin/nginx").exists() {
+        return Ok(());
+    }
+    apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
 }
 
 /// An S3 server that checks signatures and checksums, for the store's tests; its program.

@@ -30,6 +30,18 @@ fn bounded(file: &str, stream: impl Read, limit: u64) -> Result<Vec<u8>, Error> 
 /// # Errors
 /// [`Error::TooLarge`] for more than the ratio or the total of `limits`, [`Error::Malformed`] for damaged streams.
 pub(crate) fn gunzip(file: &str, bytes: &[u8], limits: &Limits) -> Result<Vec<u8>, Error> {
+    let limit = limits.inflated(bytes.len() as u64);
+    // Counted before it is kept: a bomb of 20 MB would otherwise fill 2 GB before it meets its limit.
+    let counted = std::io::copy(
+        &mut flate2::read::MultiGzDecoder::new(bytes).take(limit.saturating_add(1)),
+        &mut std::io::sink(),
+    );
+    if let Ok(value) = counted
+        && value > limit
+    {
+        let what = "the decompressed size in bytes";
+        return Err(Error::TooLarge { file: Some(file.to_owned()), what, value, limit });
+    }
     bounded(file, flate2::read::MultiGzDecoder::new(bytes), limits.inflated(bytes.len() as u64))
 }
 
@@ -49,11 +61,15 @@ pub(crate) fn inflate(file: &str, bytes: &[u8], limits: &Limits) -> Result<Vec<u
     bounded(file, flate2::read::DeflateDecoder::new(bytes), limits.inflated(bytes.len() as u64))
 }
 
-/// The number of entries that the end record of a zip states; zip64 archives state 65,535 here.
-fn stated_entries(bytes: &[u8]) -> usize {
+/// The number of entries that the end records of a zip state: the larger of the old one's and zip64's, where there is one.
+fn stated_entries(bytes: &[u8]) -> u64 {
     let tail = &bytes[bytes.len().saturating_sub(65_557)..];
-    let at = (0..tail.len().saturating_sub(21)).rev().find(|&i| tail[i..].starts_with(b"PK\x05\x06"));
-    at.map_or(0, |i| usize::from(u16::from_le_bytes([tail[i + 10], tail[i + 11]])))
+    let last = |mark: &[u8; 4], length: usize| {
+        (0..(tail.len() + 1).saturating_sub(length)).rev().find(|&i| tail[i..].starts_with(mark)).map(|i| &tail[i..])
+    };
+    let old = last(b"PK\x05\x06", 22).map_or(0, |end| u64::from(u16::from_le_bytes([end[10], end[11]])));
+    let zip64 = last(b"PK\x06\x06", 56).and_then(|end| Some(u64::from_le_bytes(end[32..40].try_into().ok()?)));
+    old.max(zip64.unwrap_or(0))
 }
 
 /// The files of a zip, sorted as they are stored; system files are left out.
@@ -64,12 +80,12 @@ fn stated_entries(bytes: &[u8]) -> usize {
 pub(crate) fn unzip(archive: &NamedBytes, limits: &Limits) -> Result<Vec<NamedBytes>, Error> {
     let name = archive.name.as_str();
     let entries = stated_entries(&archive.bytes);
-    if entries > limits.entries {
+    if entries > limits.entries as u64 {
         let what = "the number of files in the archive";
         return Err(Error::TooLarge {
             file: Some(name.to_owned()),
             what,
-            value: entries as u64,
+            value: entries,
             limit: limits.entries as u64,
         });
     }

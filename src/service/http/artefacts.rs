@@ -70,6 +70,9 @@ async fn artefact(
 #[into_params(parameter_in = Query)]
 struct Wanted {
     /// `json`, `glb`, `vtp`, `stl`, `csv` or `html` (or a media type); goes before Accept.
+    #[param(
+        pattern = "^(json|glb|gltf|vtp|vtk|stl|csv|html|application/json|model/gltf-binary|application/x-vtk[+]xml|model/stl|text/csv|text/html)$"
+    )]
     format: Option<String>,
 }
 

@@ -8,7 +8,7 @@ use crate::queue::EventRow;
 use crate::state::State;
 use axum::Json;
 use axum::extract::{Path, Query, State as Shared};
-use axum::http::{HeaderMap, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse as _, Response};
 use futures::Stream;
@@ -41,15 +41,28 @@ struct After {
     after: Option<i64>,
 }
 
+/// One event of the stream, as the fields of its block.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code, reason = "describes the stream in the OpenAPI document")]
+struct StreamedEvent {
+    /// Number of the event; send it as Last-Event-ID to resume after it.
+    id: String,
+    /// `progress`, `stage` or `state`.
+    event: String,
+    /// EventData as JSON text.
+    data: String,
+}
+
 /// Follows a job: `event: progress|stage|state`. The stream ends with the job; `Accept: application/json` gives a list.
 #[utoipa::path(get, path = "/v1/jobs/{id}/events", operation_id = "follow_job", tag = "jobs", security(("key" = [])),
     params(("id" = Uuid, Path, description = "Job"), After,
         ("Last-Event-ID" = Option<i64>, Header, description = "Resume after this event")),
     responses(
         (status = 200, description = "Events", content(
-            (String = "text/event-stream"),
+            (StreamedEvent = "text/event-stream"),
             (EventList = "application/json")
         )),
+        (status = 400, description = "An id of an event that cannot be one", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "No such job", body = Problem, content_type = "application/problem+json")
     ))]
 async fn events(
@@ -61,7 +74,17 @@ async fn events(
 ) -> Result<Response, Problem> {
     let (id, _) = job_of(&state, &who, &id).await?;
     let text = |name: &str| headers.get(name).and_then(|v| v.to_str().ok());
-    let after = text("last-event-id").and_then(|v| v.parse().ok()).or(after.after).unwrap_or(0);
+    let resumed = match headers.get("last-event-id") {
+        None => None,
+        Some(value) => Some(value.to_str().ok().and_then(|v| v.trim().parse().ok()).ok_or_else(|| {
+            Problem::new(
+                StatusCode::BAD_REQUEST,
+                "bad_request",
+                "Last-Event-ID must be the id of an event of this job.",
+            )
+        })?),
+    };
+    let after = resumed.or(after.after).unwrap_or(0);
     let accept = text(header::ACCEPT.as_str()).unwrap_or("");
     if accept.contains("application/json") && !accept.contains("text/event-stream") {
         return Ok(Json(listed(&state, id, after).await?).into_response());

@@ -31,6 +31,24 @@ pub(super) async fn headers(request: Request, next: Next) -> Response {
     response
 }
 
+/// A body is taken as it is: what inflates on the way in is decided by `artefact`'s limits alone (CVE-2026-5438).
+pub(super) async fn plain(request: Request, next: Next) -> Response {
+    let coded = request
+        .headers()
+        .get(header::CONTENT_ENCODING)
+        .is_some_and(|v| !v.as_bytes().eq_ignore_ascii_case(b"identity"));
+    if coded {
+        return Problem::new(
+            StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            "content_encoding",
+            "Send the body without Content-Encoding; a zip or a .nii.gz file is opened here.",
+        )
+        .with_header("accept-encoding", "identity")
+        .into_response();
+    }
+    next.run(request).await
+}
+
 /// Without keys, only a Host that names this loopback listener is served: a page of a foreign name that resolves to
 /// 127.0.0.1 (DNS rebinding) sends its own name here.
 pub(super) async fn host(Shared(state): Shared<State>, request: Request, next: Next) -> Response {

@@ -24,6 +24,8 @@ use uuid::Uuid;
 
 /// Longest long poll, seconds.
 const LONGEST_WAIT: u64 = 60;
+/// More than a day of waiting is a mistake, not a wish.
+const LONGEST_ASKED: u64 = 86_400;
 /// Longest page.
 const LONGEST_PAGE: i64 = 200;
 /// Page without `limit`.
@@ -67,7 +69,7 @@ struct SubmitForm {
     #[schema(value_type = Option<Object>)]
     plan: Option<String>,
     /// Files: a zip, DICOM files, one volume, or grey slices with a plan that gives their geometry.
-    #[schema(value_type = Vec<String>, format = Binary)]
+    #[schema(value_type = Vec<String>, format = Binary, min_items = 1)]
     input: Vec<Vec<u8>>,
 }
 
@@ -92,16 +94,30 @@ struct Checked {
     input: super::shapes::InputShape,
 }
 
+/// A 200 of a sent scan.
+#[derive(utoipa::ToSchema)]
+#[serde(untagged)]
+#[allow(dead_code, reason = "describes the answer in the OpenAPI document")]
+enum Taken {
+    /// The job.
+    Job(Box<Job>),
+    /// With `validate`.
+    Checked(Checked),
+}
+
 /// Sends a scan and makes a job. A 202 is given once the job is durable.
 #[utoipa::path(post, path = "/v1/jobs", operation_id = "create_job", tag = "jobs", security(("key" = [])),
     params(Taking,
-        ("Idempotency-Key" = Option<String>, Header, description = "The same key with the same input and plan gives the same job"),
+        ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
     ),
-    request_body(content = SubmitForm, content_type = "multipart/form-data"),
+    request_body(content((SubmitForm = "multipart/form-data"), (super::uploads::FromUpload = "application/json"))),
     responses(
         (status = 202, description = "Accepted", body = Job),
-        (status = 200, description = "Ended within the wait, or the key was used before; with `validate`, what was read", body = Job),
+        (status = 404, description = "No such upload", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The upload is not whole yet", body = Problem, content_type = "application/problem+json"),
+        (status = 423, description = "A call is still sending to the upload", body = Problem, content_type = "application/problem+json"),
+        (status = 200, description = "Ended within the wait, or the key was used before; with `validate`, what was read", body = Taken),
         (status = 400, description = "The upload is broken", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "A limit was met", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "Not multipart/form-data, or files that cannot be read", body = Problem, content_type = "application/problem+json"),
@@ -121,9 +137,13 @@ async fn create(
         return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
     }
     let headers = request.headers().clone();
-    let form = form(&state, &who, request).await?;
     let key = idempotency_key(&headers)?;
-    let upload = multipart::read(&state, form).await?;
+    let (upload, resumable) = if names_upload(&headers) {
+        let (upload, id) = super::uploads::taken(&state, &who, request.into_body()).await?;
+        (upload, Some(id))
+    } else {
+        (multipart::read(&state, form(&state, &who, request).await?).await?, None)
+    };
     let files = intake(&state.config, upload.files).await?;
     let (input, files) =
         tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
@@ -163,9 +183,18 @@ async fn create(
     if !replayed {
         state.audit(&who, &trace.0, "job.create", &row.id).await?;
     }
+    if let Some(id) = resumable {
+        crate::uploads::used(state.queue.db(), &who.tenant, id).await?;
+    }
     let waited = preferred_wait(&headers);
     let row = wait(&state, &who, row, waited, |row| row.state.is_final()).await?;
     Ok(accepted(row, waited, replayed))
+}
+
+/// Whether the body is JSON that names a resumable upload.
+fn names_upload(headers: &HeaderMap) -> bool {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    kind.split(';').next().is_some_and(|kind| kind.trim().eq_ignore_ascii_case("application/json"))
 }
 
 /// The multipart body; a Content-Length beyond the limit is refused before a byte is read.
@@ -247,7 +276,9 @@ fn accepted(row: JobRow, waited: Option<Duration>, replayed: bool) -> Response {
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
     match value.to_str() {
-        Ok(text) if !text.is_empty() && text.len() <= LONGEST_KEY => Ok(Some(text.to_owned())),
+        Ok(text) if (1..=LONGEST_KEY).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_graphic()) => {
+            Ok(Some(text.to_owned()))
+        }
         _ => Err(Problem::new(
             StatusCode::BAD_REQUEST,
             "idempotency.key",
@@ -326,7 +357,11 @@ async fn list(
     who: Principal,
     Query(listing): Query<Listing>,
 ) -> Result<Response, Problem> {
-    let limit = listing.limit.unwrap_or(USUAL_PAGE).clamp(1, LONGEST_PAGE);
+    let limit = listing.limit.unwrap_or(USUAL_PAGE);
+    if !(1..=LONGEST_PAGE).contains(&limit) {
+        let detail = format!("The limit must be 1 to {LONGEST_PAGE}; it is {limit}.");
+        return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
+    }
     // One more than asked for tells whether there is a next page.
     let page = Page { state: listing.state, before: listing.before, limit: limit + 1 };
     let mut rows = state.queue.jobs(&who.tenant, &page).await?;
@@ -348,7 +383,8 @@ async fn list(
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
 #[into_params(parameter_in = Query)]
 struct Waiting {
-    /// Seconds to wait for the job's end (with If-None-Match: for any change), at most 60.
+    /// Seconds to wait for the job's end (with If-None-Match: for any change); 60 is the longest that is granted.
+    #[param(minimum = 0, maximum = 86400)]
     wait: Option<u64>,
 }
 
@@ -369,6 +405,10 @@ async fn read(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let (_, row) = job_of(&state, &who, &id).await?;
+    if waiting.wait.is_some_and(|seconds| seconds > LONGEST_ASKED) {
+        let detail = format!("wait must be 0 to {LONGEST_ASKED} seconds.");
+        return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
+    }
     let seen = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
     let time = waiting.wait.map(|s| Duration::from_secs(s.min(LONGEST_WAIT)));
     let known = |row: &JobRow| seen.is_some_and(|list| range::matches(list, &tag(row)));
@@ -423,6 +463,7 @@ struct Filter {
     /// `queued` or `running`; both without.
     state: Option<JobState>,
     /// Only jobs created before this time (RFC 3339).
+    #[param(format = DateTime)]
     created_before: Option<String>,
 }
 

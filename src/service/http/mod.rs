@@ -1,10 +1,12 @@
 //! The network face: one router per resource, one layer that makes every error a problem, one place for headers.
 
 mod artefacts;
+mod describe;
 mod events;
 mod guard;
 mod health;
 mod jobs;
+mod listen;
 mod multipart;
 mod portal;
 pub(crate) mod problems;
@@ -12,8 +14,11 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod uploads;
 mod webhooks;
 mod workers;
+
+pub(crate) use listen::listen;
 
 use crate::state::State;
 use axum::Router;
@@ -62,6 +67,7 @@ impl utoipa::Modify for Keys {
 fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
+        .merge(uploads::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
@@ -73,12 +79,15 @@ fn documented() -> OpenApiRouter<State> {
 
 /// The OpenAPI document of every documented route.
 pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
-    documented().into_openapi()
+    let mut document = documented().into_openapi();
+    describe::complete(&mut document);
+    document
 }
 
 /// The whole service as one router.
 pub(crate) fn router(state: State) -> Router {
-    let (api, document) = documented().split_for_parts();
+    let (api, mut document) = documented().split_for_parts();
+    describe::complete(&mut document);
     let document = Arc::new(document);
     let page = portal::router().layer(CompressionLayer::new());
     let described = Router::new()
@@ -92,6 +101,8 @@ pub(crate) fn router(state: State) -> Router {
             use axum::response::IntoResponse as _;
             crate::error::Problem::internal("a handler panicked").into_response()
         }))
+        .layer(from_fn(listen::paced))
+        .layer(from_fn(guard::plain))
         .layer(from_fn_with_state(state.clone(), guard::host))
         .layer(from_fn(guard::headers))
         .layer(from_fn(problems::layer))

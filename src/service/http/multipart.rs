@@ -13,8 +13,8 @@ use tokio::sync::{OwnedSemaphorePermit, TryAcquireError};
 
 /// Most parts of one upload (4096 slices and some sidecars).
 const MOST_PARTS: usize = 8192;
-/// Largest plan, bytes: a position for each of 4096 slices is below 100 kB.
-const LARGEST_PLAN: usize = 1 << 20;
+/// Largest plan, bytes: a position for each of 4096 slices is below 100 kB; 1 MiB of nested lists took 70 MiB to read.
+pub(super) const LARGEST_PLAN: usize = 512 << 10;
 
 /// A read upload.
 #[derive(Debug)]
@@ -49,7 +49,7 @@ impl Budget {
     }
 
     /// Takes what `more` bytes need.
-    fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
+    pub(super) fn grow(&mut self, state: &State, more: usize) -> Result<(), Problem> {
         self.count(state, more)?;
         while (self.permits.len() as u64) * UPLOAD_UNIT < self.bytes {
             match state.uploads.clone().try_acquire_owned() {

@@ -264,7 +264,10 @@ async fn an_upload_of_nothing_is_refused_and_stores_nothing() {
     let plan = send(multipart::Form::new().text("plan", "[").part("input", bytes())).await.unwrap();
     assert_eq!(problem(plan, 422).await, "plan.json");
     let json = service.request(Method::POST, "/v1/jobs").json(&json!({"upload": "x"})).send().await.unwrap();
-    assert_eq!(problem(json, 415).await, "media_type");
+    assert_eq!(problem(json, 404).await, "not_found");
+    let text =
+        service.request(Method::POST, "/v1/jobs").header("content-type", "text/plain").body("x").send().await.unwrap();
+    assert_eq!(problem(text, 415).await, "media_type");
     let cut = service.request(Method::POST, "/v1/jobs").header("content-type", "multipart/form-data; boundary=b");
     assert_eq!(problem(cut.body("--b\r\nContent-Disp").send().await.unwrap(), 400).await, "upload.broken");
     assert!(files(&service.data().join("store")).is_empty());

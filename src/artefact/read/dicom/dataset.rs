@@ -63,7 +63,8 @@ impl<'a> DataSet<'a> {
     }
     /// An unsigned short.
     pub(crate) fn short(&self, tag: Tag) -> Option<u16> {
-        let b = self.bytes(tag)?.first_chunk::<2>()?;
+        // Exactly two bytes: sizes sent as UL would lose their upper half here and overflowed elsewhere (CVE-2026-5442).
+        let b = <&[u8; 2]>::try_from(self.bytes(tag)?).ok()?;
         Some(match self.order {
             Order::Little => u16::from_le_bytes(*b),
             Order::Big => u16::from_be_bytes(*b),

@@ -1,0 +1,98 @@
+//! The listener: every connection is bounded in time and in the size of its headers.
+//!
+//! axum's own `serve` waits for a request's headers for ever, so a client that sends one byte a minute holds a connection
+//! for as long as it likes (slow loris). Here headers must be whole within [`HEADERS`] and fit into [`HEADER_BYTES`]
+//! (hyper answers 431), and a body must come at [`SLOWEST`] bytes a second or faster after its first [`PATIENCE`]
+//! (`upload.broken`, 400). Answers are not bounded: an event stream may live as long as its job.
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::Request;
+use axum::middleware::Next;
+use axum::response::Response;
+use futures::StreamExt as _;
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::server::conn::auto::Builder;
+use hyper_util::server::graceful::GracefulShutdown;
+use hyper_util::service::TowerToHyperService;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+/// A request's headers must be whole within this time.
+const HEADERS: Duration = Duration::from_secs(10);
+/// Most bytes of a request's headers (and the most that is read ahead).
+const HEADER_BYTES: usize = 64 << 10;
+/// How long a body may take whatever its size.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Beyond [`PATIENCE`], a body's bytes a second; a modem of 1998 is faster.
+const SLOWEST: u64 = 1024;
+/// Most connections at the same time; one more is closed at once, so that descriptors are left for files.
+const CONNECTIONS: usize = 4096;
+/// After a failed accept (no descriptors left, say).
+const PAUSE: Duration = Duration::from_millis(50);
+
+/// Serves until shutdown, then lets open requests end.
+pub(crate) async fn listen(listener: TcpListener, router: Router, shutdown: CancellationToken) {
+    let room = Arc::new(Semaphore::new(CONNECTIONS));
+    let graceful = GracefulShutdown::new();
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = shutdown.cancelled() => break,
+        };
+        match accepted {
+            Ok((stream, _)) => match Arc::clone(&room).try_acquire_owned() {
+                Ok(permit) => {
+                    tokio::spawn(connection(stream, router.clone(), graceful.watcher(), permit));
+                }
+                Err(_) => tracing::warn!(most = CONNECTIONS, "a connection was closed: there are too many"),
+            },
+            Err(error) => {
+                tracing::warn!(%error, "cannot accept a connection");
+                tokio::time::sleep(PAUSE).await;
+            }
+        }
+    }
+    drop(listener);
+    graceful.shutdown().await;
+}
+
+async fn connection(
+    stream: TcpStream,
+    router: Router,
+    watcher: hyper_util::server::graceful::Watcher,
+    permit: OwnedSemaphorePermit,
+) {
+    // Small answers go out at once; a socket that cannot do that still works.
+    let _ = stream.set_nodelay(true);
+    let mut builder = Builder::new(TokioExecutor::new());
+    builder.http1().timer(TokioTimer::new()).header_read_timeout(HEADERS).max_buf_size(HEADER_BYTES);
+    builder.http2().timer(TokioTimer::new()).max_header_list_size(16 << 10).max_concurrent_streams(100);
+    let served = builder.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router)).into_owned();
+    if let Err(error) = watcher.watch(served).await {
+        tracing::debug!(%error, "a connection ended early");
+    }
+    drop(permit);
+}
+
+/// Breaks off a body that does not come.
+pub(super) async fn paced(request: Request, next: Next) -> Response {
+    let (parts, body) = request.into_parts();
+    let start = Instant::now();
+    let paced = futures::stream::unfold((body.into_data_stream(), 0_u64), move |(mut stream, mut seen)| async move {
+        let until = start + PATIENCE + Duration::from_secs(seen / SLOWEST);
+        let part = match tokio::time::timeout_at(until, stream.next()).await {
+            Ok(part) => part?,
+            Err(_) => {
+                Err(axum::Error::new(std::io::Error::new(std::io::ErrorKind::TimedOut, "the body came too slowly")))
+            }
+        };
+        seen += part.as_ref().map_or(0, |bytes| bytes.len() as u64);
+        Some((part, (stream, seen)))
+    });
+    next.run(Request::from_parts(parts, Body::from_stream(paced))).await
+}
