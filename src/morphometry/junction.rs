@@ -306,11 +306,22 @@ fn turn_of(tracks: &[Track], legs: &[Leg], radii: &[f64], axes: &Axes, ruler: Ru
     (windows, moved, crotch.min(longest))
 }
 
-/// Flags the sections of a leg that lie within the crotch distance.
+/// Mouth of a side branch along the vessel that runs on past it, in its radii, either way: an ellipse of 45 degrees and
+/// the rounding of its rim. What leaks farther is known by its shape.
+const MOUTH_RADII: f64 = 2.0;
+
+/// Flags the sections of a leg that lie within the crotch distance; of a vessel that runs on past a thin side branch, those
+/// at its mouth.
 pub(crate) fn flag(tracks: &mut [Track], legs: &[Leg], axes: &Axes) {
     for &leg in legs {
+        let back = Leg { reversed: !leg.reversed, ..leg };
+        let mouth = onward(tracks, back).map(|next| {
+            let sides = legs.iter().filter(|l| l.track != leg.track && l.track != next.track);
+            MOUTH_RADII * sides.map(|l| tracks[l.track].radius()).fold(0.0, f64::max)
+        });
+        let reach = mouth.map_or(axes.crotch, |m| m.min(axes.crotch));
         let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
-        for s in samples.iter().filter(|s| s.distance < axes.crotch) {
+        for s in samples.iter().filter(|s| s.distance < reach) {
             tracks[s.track].sections[s.index].in_junction = true;
         }
     }

@@ -89,9 +89,14 @@ pub fn measure_with_bands(
         from: settings.fit_from_diameters.unwrap_or(0.0),
         to: settings.fit_to_diameters,
     };
-    let fitted = solve_junctions(&tracks, &places, ruler, ctx)?;
-    tracks.iter_mut().for_each(Track::reset_junction);
-    flag_all(&mut tracks, &places, &fitted);
+    let mut fitted = solve_junctions(&tracks, &places, ruler, ctx)?;
+    for turn in 0..=SETTLING_TURNS {
+        tracks.iter_mut().for_each(Track::reset_junction);
+        flag_all(&mut tracks, &places, &fitted);
+        if turn < SETTLING_TURNS {
+            fitted = solve_junctions(&tracks, &places, ruler, ctx)?;
+        }
+    }
     curvature(&mut tracks, ctx)?;
     ctx.progress(0.9);
     let varied = match draws.filter(|d| d.count() > 0) {
@@ -121,6 +126,10 @@ pub fn measure_with_bands(
     ctx.progress(1.0);
     Ok(Morphometry { branches, junctions, warnings })
 }
+
+/// Times that the junctions are solved again with each other's overlaps as they are known by then: the first, from rough
+/// directions, may claim a whole branch between two junctions for itself. A vessel with one junction does not change.
+const SETTLING_TURNS: usize = 3;
 
 fn check_window(settings: &Settings) -> Result<(), Error> {
     let to = settings.fit_to_diameters;
