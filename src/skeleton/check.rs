@@ -3,13 +3,9 @@
 use crate::{CapHint, Error, MedialGraph, Node, NodeKind};
 use implicit::Field;
 
-/// Halfway between two points of a line f may be below zero by this share of their distance: voxel lines cut the corners
-/// of a hole two voxels wide between touching lumens (.11 was met), and f is about a distance there.
-const CORNER: f64 = 0.25;
-
 /// Whether a finished graph can be measured: every cap has exactly one end; every end has one branch, every junction
 /// three or more (or is the base of a closed line); every line runs from its first node to its last with growing arc
-/// length, f > 0 at its points and no wall crossed between them; every inscribed radius is positive.
+/// length and f > 0 at its points and halfway between; every inscribed radius is positive.
 ///
 /// # Errors
 /// The first offence: [`Error::CapWithoutEnd`], [`Error::CapShared`], [`Error::Degree`], [`Error::Line`],
@@ -58,9 +54,9 @@ fn check_line(graph: &MedialGraph, field: &dyn Field, edge: usize) -> Result<(),
         if !(step.is_finite() && step > 0.0) {
             return Err(Error::Abscissa { edge, point: i + 1, at: pair[1] });
         }
-        for (at, least) in [(pair[0], 0.0), (pair[0].lerp(pair[1], 0.5), -CORNER * step), (pair[1], 0.0)] {
+        for at in [pair[0], pair[0].lerp(pair[1], 0.5), pair[1]] {
             let value = field.value(at);
-            if value.is_nan() || value <= least {
+            if value.is_nan() || value <= 0.0 {
                 return Err(Error::Outside { edge, value, at });
             }
         }

@@ -23,7 +23,6 @@ const RADIUS_JUMP: f64 = 1.4;
 pub struct Lumen<'a> {
     domain: Domain<'a>,
     volume: &'a BitVolume,
-    grid: &'a Grid,
     to_voxel: Affine<Patient, Voxel>,
     spacing_mm: f64,
     limit_mm: f64,
@@ -52,11 +51,11 @@ pub(crate) struct Section {
 impl<'a> Lumen<'a> {
     /// The lumen of `field` within `cuts`, whose voxels (before thinning) are `volume` on `grid` (see
     /// [`crate::voxelise`]). `None` when the grid's map is singular.
-    pub fn new(field: &'a dyn Field, cuts: &'a [CutPlane], volume: &'a BitVolume, grid: &'a Grid) -> Option<Self> {
+    pub fn new(field: &'a dyn Field, cuts: &'a [CutPlane], volume: &'a BitVolume, grid: &Grid) -> Option<Self> {
         let to_voxel = grid.to_patient.inverse()?;
         let spacing_mm = (grid.point(1, 0, 0) - grid.point(0, 0, 0)).length();
         let limit_mm = field.bounds().size().length();
-        Some(Self { domain: Domain { field, cuts }, volume, grid, to_voxel, spacing_mm, limit_mm })
+        Some(Self { domain: Domain { field, cuts }, volume, to_voxel, spacing_mm, limit_mm })
     }
 
     /// Spacing of the voxels, mm.
@@ -83,34 +82,15 @@ impl<'a> Lumen<'a> {
     }
 
     /// A point that lies up to half a voxel beyond the wall, or hardly inside it, moved a tenth of a voxel inside: voxel
-    /// lines in the crotch of two vessels side by side graze the wall between them. Where f is flat there (the thin wall
-    /// between two lumens) the nearest lumen voxel takes its place.
+    /// lines in the crotch of two vessels side by side graze the wall between them.
     pub(crate) fn inward(&self, x: P3) -> P3 {
         let (margin, reach) = (0.1 * self.spacing_mm, 0.5 * self.spacing_mm);
         let (f, g) = self.domain.field.gradient(x);
         let slope = g.length();
-        if f >= margin * slope && f > 0.0 {
+        if f >= margin * slope || f < -reach * slope || slope <= f64::MIN_POSITIVE {
             return x;
         }
-        if f > -reach * slope {
-            let moved = x + g * ((margin * slope - f) / (slope * slope));
-            if self.contains(moved) {
-                return moved;
-            }
-        }
-        if f > 0.0 { x } else { self.nearest_voxel(x).unwrap_or(x) }
-    }
-
-    /// Centre of the nearest lumen voxel among those around a point.
-    fn nearest_voxel(&self, x: P3) -> Option<P3> {
-        let v = self.to_voxel.point(x).to_array().map(f64::round);
-        let beside = |i: usize| [i % 3, i / 3 % 3, i / 9].map(|o| o as f64 - 1.0);
-        let lumen = (0..27)
-            .map(beside)
-            .map(|o| std::array::from_fn(|a| v[a] + o[a]))
-            .filter(|c: &[f64; 3]| c.iter().all(|c| c.abs() < 1e9) && self.volume.at(c.map(|c| c as isize)));
-        let centres = lumen.map(|c| c.map(|c| c as usize)).map(|[i, j, k]| self.grid.point(i, j, k));
-        centres.min_by(|a, b| a.distance(x).total_cmp(&b.distance(x)))
+        x + g * ((margin * slope - f) / (slope * slope))
     }
 
     /// Length of the straight line between two points that is not lumen, to a quarter of a voxel, mm.
