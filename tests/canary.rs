@@ -3,11 +3,13 @@
 //! that sent them, in the answer to that call, and nowhere else.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod serving;
+
 use serde_json::Value;
 use std::fs;
-use std::io::{BufRead, BufReader, Cursor, Write};
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
@@ -30,20 +32,10 @@ impl Server {
         let folder = TempDir::new().unwrap();
         fs::create_dir(folder.path().join("tmp")).unwrap();
         let log = fs::File::create(folder.path().join("log")).unwrap();
-        let mut process = Command::new(BINARY)
-            .args(["serve", "--no-auth", "--listen", "127.0.0.1:0", "--data-dir"])
-            .arg(folder.path().join("data"))
-            .env("RUST_LOG", "trace")
-            .env("TMPDIR", folder.path().join("tmp"))
-            .stderr(log)
-            .stdout(Stdio::piped())
-            .stdin(Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(process.stdout.take().unwrap()).lines();
-        let address = lines.find_map(|l| l.unwrap().strip_prefix("listening on ").map(str::to_owned)).unwrap();
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { process, address: address.trim().to_owned(), folder }
+        let (process, address) = serving::serve(&folder.path().join("data"), |command| {
+            command.env("RUST_LOG", "trace").env("TMPDIR", folder.path().join("tmp")).stderr(log);
+        });
+        Self { process, address, folder }
     }
 }
 

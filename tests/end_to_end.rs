@@ -1,10 +1,11 @@
 //! The release bars of the whole way through, against the binary: bytes, formats, service, kill, cancel, bad input.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod serving;
+
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
@@ -152,17 +153,8 @@ struct Server {
 impl Server {
     fn start(data: &Path) -> Self {
         service::tls::provide();
-        let mut process = Command::new(BINARY)
-            .args(["serve", "--no-auth", "--listen", "127.0.0.1:0", "--data-dir", path(data)])
-            .env("RUST_LOG", "error")
-            .stdout(Stdio::piped())
-            .stdin(Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(process.stdout.take().unwrap()).lines();
-        let address = lines.find_map(|l| l.unwrap().strip_prefix("listening on ").map(str::to_owned)).unwrap();
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { process, address: address.trim().to_owned(), data: data.to_owned() }
+        let (process, address) = serving::serve(data, |_| ());
+        Self { process, address, data: data.to_owned() }
     }
     fn kill(mut self) {
         self.process.kill().unwrap();

@@ -3,11 +3,13 @@
 //! and others are answered meanwhile.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod serving;
+
 use serde_json::Value;
 use std::fs;
-use std::io::{BufRead, BufReader, Cursor, Read, Write};
+use std::io::{Cursor, Read, Write};
 use std::net::TcpStream;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -31,18 +33,9 @@ struct Server {
 impl Server {
     fn start() -> Self {
         let data = TempDir::new().unwrap();
-        let mut process = Command::new(env!("CARGO_BIN_EXE_vasculum"))
-            .args(["serve", "--no-auth", "--listen", "127.0.0.1:0", "--data-dir"])
-            .arg(data.path())
-            .env("RUST_LOG", "error")
-            .stdout(Stdio::piped())
-            .stdin(Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(process.stdout.take().unwrap()).lines();
-        let address = lines.find_map(|l| l.unwrap().strip_prefix("listening on http://").map(str::to_owned)).unwrap();
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { process, address: address.trim().to_owned(), _data: data }
+        let (process, address) = serving::serve(data.path(), |_| ());
+        let address = address.trim_start_matches("http://").to_owned();
+        Self { process, address, _data: data }
     }
 
     /// MiB of a line of /proc/PID/status.

@@ -67,8 +67,7 @@ pub(super) async fn taken(
         return Err(Problem::new(StatusCode::CONFLICT, "upload.unfinished", detail));
     }
     let id = ticket.id;
-    let read = tokio::task::spawn_blocking(move || partial.read()).await.map_err(Problem::internal)?;
-    let file = read.map_err(fault)?;
+    let file = on_disk(move || partial.read()).await?;
     Ok((multipart::Upload { plan, files: vec![file], budget }, id))
 }
 
@@ -124,8 +123,7 @@ async fn create(
         return Err(Problem::new(StatusCode::CONFLICT, "upload.many", detail));
     }
     let (folder, made, name) = (uploads::folder(&state.config.data_dir), ticket.clone(), file_name(&headers));
-    let made = tokio::task::spawn_blocking(move || Partial::create(&folder, &made, &name)).await;
-    made.map_err(Problem::internal)?.map_err(fault)?;
+    on_disk(move || Partial::create(&folder, &made, &name)).await?;
     state.audit(&who, &trace.0, "upload.create", &ticket.id.to_string()).await?;
     let expires = expiry(&state, &who, &ticket).await?;
     let location = format!("/v1/uploads/{}", ticket.text());
@@ -151,8 +149,7 @@ async fn offset(
     spoken(&headers)?;
     let (ticket, length) = known(&state, &who, &id).await?;
     let (folder, asked) = (uploads::folder(&state.config.data_dir), ticket.clone());
-    let offset = tokio::task::spawn_blocking(move || Partial::offset(&folder, &asked)).await;
-    let offset = offset.map_err(Problem::internal)?.map_err(fault)?.to_string();
+    let offset = on_disk(move || Partial::offset(&folder, &asked)).await?.to_string();
     let expires = expiry(&state, &who, &ticket).await?;
     let length = length.to_string();
     let told = [("upload-offset", offset.as_str()), ("upload-length", &length), ("upload-expires", &expires)];
@@ -298,17 +295,17 @@ async fn received(partial: Partial, body: Body, mut left: u64, check: Option<Pro
         partial.keep();
     }
     let offset = partial.offset;
-    tokio::task::spawn_blocking(move || partial.sync()).await.map_err(Problem::internal)?.map_err(fault)?;
+    on_disk(move || partial.sync()).await?;
     broken.map_or(Ok(offset), Err)
 }
 
 /// Appends bytes in frames, away from the async workers.
 async fn written(mut partial: Partial, bytes: Vec<u8>) -> Result<Partial, Problem> {
-    let done = tokio::task::spawn_blocking(move || {
+    on_disk(move || {
         bytes.chunks(FRAME).try_for_each(|frame| partial.append(frame))?;
         Ok(partial)
-    });
-    done.await.map_err(Problem::internal)?.map_err(fault)
+    })
+    .await
 }
 
 /// The caller's upload and its length.
@@ -321,8 +318,12 @@ async fn known(state: &State, who: &Principal, id: &str) -> Result<(Ticket, u64)
 
 async fn opened(state: &State, ticket: &Ticket) -> Result<Partial, Problem> {
     let (folder, ticket) = (uploads::folder(&state.config.data_dir), ticket.clone());
-    let opened = tokio::task::spawn_blocking(move || Partial::open(&folder, &ticket)).await;
-    opened.map_err(Problem::internal)?.map_err(fault)
+    on_disk(move || Partial::open(&folder, &ticket)).await
+}
+
+/// Work on an upload's file, away from the async workers.
+async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> std::io::Result<T> + Send + 'static) -> Result<T, Problem> {
+    tokio::task::spawn_blocking(work).await.map_err(Problem::internal)?.map_err(fault)
 }
 
 fn fault(error: std::io::Error) -> Problem {
