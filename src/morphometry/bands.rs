@@ -11,7 +11,7 @@
 
 use crate::Error;
 use crate::helix::FittedHelix;
-use crate::junction::{Axes, Leg, fit_window, leg_samples};
+use crate::junction::{Axes, Leg, fit_window};
 use crate::section::{Lumen, RAYS_COARSE, Ray, area_and_shift};
 use crate::track::Track;
 use crate::types::Helix;
@@ -90,7 +90,7 @@ impl Varied {
         let direction = |tracks: &[Track], leg: usize| {
             let ([from, to], fit) = &axes.windows[leg];
             fit.line?;
-            let samples = leg_samples(tracks, legs[leg], axes.origin, axes.crotch);
+            let samples = axes.samples(tracks, legs[leg]);
             fit_window(&samples, *from, *to, 0.0).line.map(|l| l.direction)
         };
         self.tracks.iter().map(|tracks| (0..legs.len()).map(|leg| direction(tracks, leg)).collect()).collect()

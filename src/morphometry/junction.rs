@@ -5,8 +5,10 @@
 //! crotch distance. Window, lines, meeting point and crotch depend on each other and are iterated to a standstill.
 //! Samples enter a window by the share of their length that lies in it, so that nothing jumps when a window moves.
 
+use crate::crotch::{divider, overlaps};
 use crate::fit::{FittedLine, fit_line, meeting_point};
 use crate::track::Track;
+use implicit::Field;
 use space::{DVec3, P3, V3};
 
 /// Window start in crotch distances: within one of them the lumens overlap. The factor is a choice, not yet swept.
@@ -16,8 +18,10 @@ pub(crate) const WINDOW_MIN: f64 = 1.0;
 /// Where the crotch reaches so far that the wanted window is shorter than this, its end is moved out.
 const WINDOW_WANTED: f64 = 1.5;
 
-/// Axes that meet further than this many (largest) radii from the graph's node do not belong to one junction's lumens.
-const STRAY_RADII: f64 = 4.0;
+/// Axes that meet further than this many (largest) radii from the graph's node do not meet in the junction: branches that
+/// bend apart have lines that cross upstream of it. At 4 the crossing of two iliac arteries' lines, 13 mm up the aorta,
+/// pushed the window outward, which moved the crossing, without end.
+const STRAY_RADII: f64 = 1.0;
 
 /// An edge seen from one of its ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,25 +42,6 @@ pub(crate) fn legs_at(tracks: &[Track], node: usize) -> Vec<Leg> {
         }
     }
     legs
-}
-
-/// Distance from the meeting point of two axes within which their lumens (round tubes of radii a and b, axes at
-/// `angle`, radians) overlap: the further of the two points where the wall lines cross, (r_b + r_a cos) / sin along a's
-/// axis; for equal radii r / tan(angle / 2). Beyond a right angle at most the larger radius, so that a pair that runs
-/// straight on, which has no crotch, does not claim one.
-pub fn crotch_distance(angle: f64, radius_a_mm: f64, radius_b_mm: f64) -> f64 {
-    let (sin, cos) = angle.sin_cos();
-    let larger = radius_a_mm.max(radius_b_mm);
-    let along_a = (radius_b_mm + radius_a_mm * cos) / sin;
-    let along_b = (radius_a_mm + radius_b_mm * cos) / sin;
-    let exact = along_a.max(along_b).max(0.0);
-    if cos > 0.0 && sin > 0.0 {
-        exact
-    } else if sin > 1e-9 {
-        exact.min(larger)
-    } else {
-        larger
-    }
 }
 
 /// A vessel runs on past side branches thinner than it by this factor, and itself changes by less than this.
@@ -85,10 +70,10 @@ fn onward(tracks: &[Track], leg: Leg) -> Option<Leg> {
     let track = &tracks[leg.track];
     let node = if leg.reversed { track.from_node } else { track.to_node };
     let mut others: Vec<Leg> = legs_at(tracks, node).into_iter().filter(|l| l.track != leg.track).collect();
-    let radius = |l: &Leg| tracks[l.track].radius();
+    let radius = |l: &Leg| tracks[l.track].own_radius();
     others.sort_by(|a, b| radius(b).total_cmp(&radius(a)));
     let (next, side) = (others.first().copied()?, others.get(1)?);
-    let (own, on) = (track.radius(), radius(&next));
+    let (own, on) = (track.own_radius(), radius(&next));
     let alike = own.max(on) < SIDE_BRANCH * own.min(on);
     let straight = tangent_at(track, leg, End::Far)?.dot(tangent_at(&tracks[next.track], next, End::Near)?);
     (alike && SIDE_BRANCH * radius(side) < own.min(on) && straight > STRAIGHT_ON).then_some(next)
@@ -124,10 +109,19 @@ pub(crate) struct LegSample {
     pub(crate) usable: bool,
 }
 
-/// A leg's samples, from the junction outward and on past thin side branches. Distance is straight within `inner` of
-/// `origin`, and along the line from where it leaves that sphere.
-pub(crate) fn leg_samples(tracks: &[Track], leg: Leg, origin: DVec3, inner: f64) -> Vec<LegSample> {
-    let mut items: Vec<([usize; 2], f64, DVec3)> = Vec::new();
+/// A point of a leg's line, with its section.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LegPoint {
+    /// Its track, and its number on it.
+    section: [usize; 2],
+    /// Distance along the branch from the graph's node, mm.
+    pub(crate) along: f64,
+    pub(crate) point: DVec3,
+}
+
+/// The line of a leg from the graph's node outward, on past thin side branches.
+pub(crate) fn leg_line(tracks: &[Track], leg: Leg) -> Vec<LegPoint> {
+    let mut items = Vec::new();
     let mut before = 0.0;
     for piece in pieces(tracks, leg) {
         let (track, length) = (&tracks[piece.track], tracks[piece.track].length());
@@ -137,25 +131,31 @@ pub(crate) fn leg_samples(tracks: &[Track], leg: Leg, origin: DVec3, inner: f64)
             let k = if piece.reversed { count - 1 - i } else { i };
             let s = &track.sections[k];
             let along = if piece.reversed { length - s.abscissa_mm } else { s.abscissa_mm };
-            items.push(([piece.track, k], before + along, s.position.raw()));
+            items.push(LegPoint { section: [piece.track, k], along: before + along, point: s.position.raw() });
         }
         before += length;
     }
+    items
+}
+
+/// A leg's samples. Distance is straight within `inner` of `origin`, and along the line from where it leaves that sphere.
+fn leg_samples(tracks: &[Track], leg: Leg, origin: DVec3, inner: f64) -> Vec<LegSample> {
+    let items = leg_line(tracks, leg);
     let n = items.len();
-    let straight = |i: usize| items[i].2.distance(origin);
+    let straight = |i: usize| items[i].point.distance(origin);
     let first = (0..n).find(|&i| straight(i) > inner).unwrap_or(n - 1);
     let start = if first == 0 {
-        items[0].1 - straight(0)
+        items[0].along - straight(0)
     } else {
         let (a, b) = (straight(first - 1), straight(first));
         let t = if b > a { ((inner - a) / (b - a)).clamp(0.0, 1.0) } else { 0.0 };
-        items[first - 1].1 + (items[first].1 - items[first - 1].1) * t - inner
+        items[first - 1].along + (items[first].along - items[first - 1].along) * t - inner
     };
     (0..n)
         .map(|i| {
-            let ([track, index], s, point) = items[i];
-            let distance = if i < first { straight(i) } else { s - start };
-            let (before, after) = (items[i.saturating_sub(1)].1, items[(i + 1).min(n - 1)].1);
+            let LegPoint { section: [track, index], along, point } = items[i];
+            let distance = if i < first { straight(i) } else { along - start };
+            let (before, after) = (items[i.saturating_sub(1)].along, items[(i + 1).min(n - 1)].along);
             let half = 0.25 * (after - before) * if i == 0 || i == n - 1 { 2.0 } else { 1.0 };
             LegSample { track, index, distance, half, point, usable: tracks[track].usable(index) }
         })
@@ -204,7 +204,8 @@ pub(crate) struct Axes {
     pub(crate) point: Option<P3>,
     /// From where distances are measured: `point`, or the graph's node.
     pub(crate) origin: DVec3,
-    pub(crate) crotch: f64,
+    /// By leg: from the origin, how far its lumen overlaps with another leg's, mm.
+    pub(crate) overlaps: Vec<f64>,
     /// By leg: window start, wanted end, and the fit.
     pub(crate) windows: Vec<([f64; 2], WindowFit)>,
     /// The window's end was moved out because the crotch reaches so far.
@@ -214,6 +215,16 @@ pub(crate) struct Axes {
 }
 
 impl Axes {
+    /// How far the lumens overlap, mm; within it distances are straight.
+    pub(crate) fn crotch(&self) -> f64 {
+        self.overlaps.iter().copied().fold(0.0, f64::max)
+    }
+
+    /// A leg's samples, their distances from the origin.
+    pub(crate) fn samples(&self, tracks: &[Track], leg: Leg) -> Vec<LegSample> {
+        leg_samples(tracks, leg, self.origin, self.crotch())
+    }
+
     /// Direction of a leg away from the junction, fitted.
     pub(crate) fn direction(&self, leg: usize) -> Option<V3> {
         self.windows[leg].1.line.map(|l| l.direction)
@@ -237,33 +248,41 @@ pub(crate) fn chord(samples: &[LegSample], origin: DVec3, radius: f64) -> Option
     (last.point - origin).try_normalize().map(V3::from_raw)
 }
 
-/// Lines, meeting point and crotch of a junction's legs, iterated.
-pub(crate) fn axes(tracks: &[Track], legs: &[Leg], node: P3, node_radius: f64, ruler: Ruler) -> Axes {
+/// Lines, meeting point and overlaps of a junction's legs, iterated.
+pub(crate) fn axes(
+    tracks: &[Track],
+    legs: &[Leg],
+    field: &dyn Field,
+    node: P3,
+    node_radius: f64,
+    ruler: Ruler,
+) -> Axes {
     const TURNS: usize = 100;
-    let radii: Vec<f64> = legs.iter().map(|&l| leg_radius(&tracks[l.track], l, node_radius)).collect();
-    let largest = radii.iter().copied().fold(node_radius, f64::max);
+    let site = Meeting::new(tracks, legs, field, node_radius);
+    let largest = site.radii.iter().copied().fold(node_radius, f64::max);
     let mut axes = Axes {
         point: None,
         origin: node.raw(),
-        crotch: 1.5 * largest,
+        overlaps: vec![1.5 * largest; legs.len()],
         windows: Vec::new(),
         moved: false,
         settled: false,
     };
     for turn in 0..TURNS {
-        let (windows, moved, crotch) = turn_of(tracks, legs, &radii, &axes, ruler);
+        let (windows, moved, directions) = site.fits(&axes, ruler);
         let lines: Vec<FittedLine> = windows.iter().filter_map(|w| w.1.line).collect();
         let point = meeting_point(&lines).filter(|p| p.distance(node) <= STRAY_RADII * largest);
-        let (origin, still) = {
-            let target = point.map_or(node.raw(), P3::raw);
-            // the first turns go all the way, later ones halfway, which stops a swing between two states
-            let pace = if turn < 20 { 1.0 } else { 0.5 };
-            let still = target.distance(axes.origin) < 1e-11 * (1.0 + target.length().min(1e3))
-                && (crotch - axes.crotch).abs() < 1e-11;
-            axes.crotch += (crotch - axes.crotch) * pace;
-            (axes.origin.lerp(target, pace), still)
-        };
-        (axes.origin, axes.point, axes.windows, axes.moved) = (origin, point, windows, moved);
+        let target = point.map_or(node.raw(), P3::raw);
+        let overlaps = site.overlaps(target, &directions);
+        // the first turns go all the way, later ones halfway, which stops a swing between two states
+        let pace = if turn < 20 { 1.0 } else { 0.5 };
+        let mut still = target.distance(axes.origin) < 1e-11 * (1.0 + target.length().min(1e3));
+        for (present, next) in axes.overlaps.iter_mut().zip(overlaps) {
+            still &= (next - *present).abs() < 1e-11;
+            *present += (next - *present) * pace;
+        }
+        axes.origin = axes.origin.lerp(target, pace);
+        (axes.point, axes.windows, axes.moved) = (point, windows, moved);
         if still {
             axes.settled = true;
             break;
@@ -272,86 +291,93 @@ pub(crate) fn axes(tracks: &[Track], legs: &[Leg], node: P3, node_radius: f64, r
     axes
 }
 
-type Turn = (Vec<([f64; 2], WindowFit)>, bool, f64);
+/// How far from the node the lumens of two legs are watched, in the largest radius: tubes at 20 degrees part 5.7 out.
+const REACH_RADII: f64 = 8.0;
 
-fn turn_of(tracks: &[Track], legs: &[Leg], radii: &[f64], axes: &Axes, ruler: Ruler) -> Turn {
-    let mut moved = false;
-    let mut windows = Vec::with_capacity(legs.len());
-    let mut directions = Vec::with_capacity(legs.len());
-    for (&leg, &radius) in legs.iter().zip(radii) {
-        let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
-        let (diameter, user_from, user_to) = match ruler {
-            Ruler::Own { to } => (2.0 * radius, 0.0, to),
-            Ruler::Shared { diameter, from, to } => (diameter, from, to),
+/// The legs that meet at a node.
+struct Meeting<'a> {
+    tracks: &'a [Track],
+    legs: &'a [Leg],
+    radii: Vec<f64>,
+    /// By pair (higher leg, lower leg): where each one's line passes the crotch between their lumens, where these part.
+    partings: Vec<Vec<Option<[DVec3; 2]>>>,
+}
+
+type Fits = (Vec<([f64; 2], WindowFit)>, bool, Vec<Option<V3>>);
+
+impl<'a> Meeting<'a> {
+    fn new(tracks: &'a [Track], legs: &'a [Leg], field: &dyn Field, node_radius: f64) -> Self {
+        let radii: Vec<f64> = legs.iter().map(|&l| leg_radius(&tracks[l.track], l, node_radius)).collect();
+        let lines: Vec<Vec<LegPoint>> = legs.iter().map(|&l| leg_line(tracks, l)).collect();
+        let reach = REACH_RADII * radii.iter().copied().fold(node_radius, f64::max);
+        let pair = |i: usize, j: usize| {
+            let crotch = divider(field, [&lines[i], &lines[j]], node_radius, reach)?.raw();
+            Some([i, j].map(|leg| nearest(&lines[leg], crotch)))
         };
-        let from = (FROM_CROTCH * axes.crotch).max(user_from * diameter);
-        let wanted = user_to * diameter;
-        let to = wanted.max(from + WINDOW_WANTED * diameter);
-        moved |= to > wanted;
-        let fit = fit_window(&samples, from, to, WINDOW_MIN * diameter);
-        directions.push(fit.line.map(|l| l.direction).or_else(|| chord(&samples, axes.origin, radius)));
-        windows.push(([from, to], fit));
+        let partings = (0..legs.len()).map(|i| (0..i).map(|j| pair(i, j)).collect()).collect();
+        Self { tracks, legs, radii, partings }
     }
-    let mut crotch: f64 = 0.0;
-    for i in 0..legs.len() {
-        for j in 0..i {
-            if let (Some(a), Some(b)) = (directions[i], directions[j]) {
-                crotch = crotch.max(crotch_distance(a.angle_to(b), radii[i], radii[j]));
+
+    /// Windows and their fits, whether an end was moved out, and directions, chords where there is no fit.
+    fn fits(&self, axes: &Axes, ruler: Ruler) -> Fits {
+        let mut moved = false;
+        let mut windows = Vec::with_capacity(self.legs.len());
+        let mut directions = Vec::with_capacity(self.legs.len());
+        for ((&leg, &radius), &overlap) in self.legs.iter().zip(&self.radii).zip(&axes.overlaps) {
+            let samples = axes.samples(self.tracks, leg);
+            let (diameter, user_from, user_to) = match ruler {
+                Ruler::Own { to } => (2.0 * radius, 0.0, to),
+                Ruler::Shared { diameter, from, to } => (diameter, from, to),
+            };
+            let from = (FROM_CROTCH * overlap).max(user_from * diameter);
+            let wanted = user_to * diameter;
+            let to = wanted.max(from + WINDOW_WANTED * diameter);
+            moved |= to > wanted;
+            let fit = fit_window(&samples, from, to, WINDOW_MIN * diameter);
+            directions.push(fit.line.map(|l| l.direction).or_else(|| chord(&samples, axes.origin, radius)));
+            windows.push(([from, to], fit));
+        }
+        (windows, moved, directions)
+    }
+
+    /// By leg: how far from `origin` its lumen overlaps with another's.
+    fn overlaps(&self, origin: DVec3, directions: &[Option<V3>]) -> Vec<f64> {
+        // branches that run side by side for their whole length would push the window past the data: the fits then fail
+        // for want of data, with a warning
+        let longest = self.legs.iter().map(|l| self.tracks[l.track].length()).fold(0.0, f64::max);
+        let mut reach = vec![0.0; self.legs.len()];
+        for (i, partings) in self.partings.iter().enumerate() {
+            for (j, parting) in partings.iter().enumerate() {
+                let (Some(a), Some(b)) = (directions[i], directions[j]) else { continue };
+                let angle = a.angle_to(b);
+                let tubes = overlaps(angle, self.radii[i], self.radii[j]);
+                let seen =
+                    parting.filter(|_| angle < std::f64::consts::FRAC_PI_2).map(|p| p.map(|x| x.distance(origin)));
+                let own = seen.map_or(tubes, |seen| [tubes[0].min(seen[0]), tubes[1].min(seen[1])]);
+                reach[i] = f64::max(reach[i], own[0].min(longest));
+                reach[j] = f64::max(reach[j], own[1].min(longest));
             }
         }
+        reach
     }
-    // branches that run side by side for their whole length would push the window past the data: the fits then fail for
-    // want of data, with a warning
-    let longest = legs.iter().map(|l| tracks[l.track].length()).fold(0.0, f64::max);
-    (windows, moved, crotch.min(longest))
 }
 
-/// Mouth of a side branch along the vessel that runs on past it, in its radii, either way: an ellipse of 45 degrees and
-/// the rounding of its rim. What leaks farther is known by its shape.
-const MOUTH_RADII: f64 = 2.0;
+/// The point of a leg's line that is nearest to `x`.
+fn nearest(line: &[LegPoint], x: DVec3) -> DVec3 {
+    let on = |pair: &[LegPoint]| {
+        let (a, b) = (pair[0].point, pair[1].point);
+        let square = (b - a).length_squared();
+        let t = if square > 0.0 { ((x - a).dot(b - a) / square).clamp(0.0, 1.0) } else { 0.0 };
+        a.lerp(b, t)
+    };
+    line.windows(2).map(on).min_by(|a, b| a.distance(x).total_cmp(&b.distance(x))).unwrap_or(x)
+}
 
-/// Flags the sections of a leg that lie within the crotch distance; of a vessel that runs on past a thin side branch, those
-/// at its mouth.
+/// Flags the sections of each leg within which its lumen overlaps with another's.
 pub(crate) fn flag(tracks: &mut [Track], legs: &[Leg], axes: &Axes) {
-    for &leg in legs {
-        let back = Leg { reversed: !leg.reversed, ..leg };
-        let mouth = onward(tracks, back).map(|next| {
-            let sides = legs.iter().filter(|l| l.track != leg.track && l.track != next.track);
-            MOUTH_RADII * sides.map(|l| tracks[l.track].radius()).fold(0.0, f64::max)
-        });
-        let reach = mouth.map_or(axes.crotch, |m| m.min(axes.crotch));
-        let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
-        for s in samples.iter().filter(|s| s.distance < reach) {
+    for (&leg, &overlap) in legs.iter().zip(&axes.overlaps) {
+        for s in axes.samples(tracks, leg).iter().filter(|s| s.distance < overlap) {
             tracks[s.track].sections[s.index].in_junction = true;
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn equal_tubes_part_at_r_over_tan_half_the_angle() {
-        for degrees in [20.0f64, 45.0, 90.0] {
-            let theta = degrees.to_radians();
-            let expected = 3.0 / (0.5 * theta).tan();
-            assert!((crotch_distance(theta, 3.0, 3.0) - expected).abs() < 1e-12);
-        }
-    }
-
-    #[test]
-    fn a_straight_pair_of_unequal_tubes_claims_no_crotch_beyond_its_radius() {
-        assert!(crotch_distance(3.1, 3.0, 2.5) <= 3.0);
-        assert!((crotch_distance(std::f64::consts::PI, 3.0, 2.5) - 3.0).abs() < 1e-9);
-    }
-
-    #[test]
-    fn the_crotch_of_unequal_tubes_is_where_their_walls_cross() {
-        let theta = 60.0f64.to_radians();
-        let s = crotch_distance(theta, 4.0, 2.0);
-        // along the thinner tube's axis, the point of its wall on the side of the thicker one lies on the thicker wall
-        let wall = s * theta.sin() - 2.0 * theta.cos();
-        assert!((wall - 4.0).abs() < 1e-12);
     }
 }

@@ -4,6 +4,7 @@
 
 mod angle;
 mod bands;
+mod crotch;
 mod error;
 mod fit;
 mod helix;
@@ -17,10 +18,10 @@ mod track;
 mod types;
 
 pub use angle::{Undefined, plane_normal};
+pub use crotch::crotch_distance;
 pub use error::Error;
 pub use fit::{FittedLine, fit_line, meeting_point};
 pub use helix::fit_helix;
-pub use junction::crotch_distance;
 pub use measure::{measure, measure_with_bands};
 pub use section::{Cut, Lumen, Outline, RAYS};
 pub use types::{

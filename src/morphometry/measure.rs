@@ -5,9 +5,7 @@ use crate::angle::{Between, Undefined, named, plane_normal, triple};
 use crate::bands::{Varied, band95};
 use crate::fit::FittedLine;
 use crate::helix::fitted;
-use crate::junction::{
-    Axes, FROM_CROTCH, Leg, Ruler, WINDOW_MIN, axes, chord, fit_window, flag, leg_radius, leg_samples, legs_at,
-};
+use crate::junction::{Axes, FROM_CROTCH, Leg, Ruler, WINDOW_MIN, axes, chord, fit_window, flag, leg_radius, legs_at};
 use crate::linear::median;
 use crate::roles::{Scope, Sites, assign};
 use crate::section::Lumen;
@@ -69,7 +67,7 @@ pub fn measure_with_bands(
     ctx.progress(0.4);
     let places = places(graph, &tracks);
     let own = Ruler::Own { to: settings.fit_to_diameters };
-    let rough = solve_junctions(&tracks, &places, |_| own, ctx)?;
+    let rough = solve_junctions(&tracks, &places, field, |_| own, ctx)?;
     flag_all(&mut tracks, &places, &rough);
     finish(&mut tracks, lumen, ctx)?;
     ctx.progress(0.8);
@@ -89,12 +87,12 @@ pub fn measure_with_bands(
         from: settings.fit_from_diameters.unwrap_or(0.0),
         to: settings.fit_to_diameters,
     };
-    let mut fitted = solve_junctions(&tracks, &places, ruler, ctx)?;
+    let mut fitted = solve_junctions(&tracks, &places, field, ruler, ctx)?;
     for turn in 0..=SETTLING_TURNS {
         tracks.iter_mut().for_each(Track::reset_junction);
         flag_all(&mut tracks, &places, &fitted);
         if turn < SETTLING_TURNS {
-            fitted = solve_junctions(&tracks, &places, ruler, ctx)?;
+            fitted = solve_junctions(&tracks, &places, field, ruler, ctx)?;
         }
     }
     curvature(&mut tracks, ctx)?;
@@ -169,12 +167,13 @@ fn places(graph: &MedialGraph, tracks: &[Track]) -> Vec<Spot> {
 fn solve_junctions(
     tracks: &[Track],
     places: &[Spot],
+    field: &dyn Field,
     ruler: impl Fn(usize) -> Ruler + Sync,
     ctx: &Ctx,
 ) -> Result<Vec<Axes>, Error> {
     Ok(ctx.map_range(places.len(), |j| {
         let p = &places[j];
-        axes(tracks, &p.legs, p.position, p.radius, ruler(j))
+        axes(tracks, &p.legs, field, p.position, p.radius, ruler(j))
     })?)
 }
 
@@ -211,7 +210,7 @@ fn rough_directions(tracks: &[Track], place: &Spot, axes: &Axes) -> Vec<Option<V
         .map(|(i, &leg)| {
             axes.direction(i).or_else(|| {
                 let track = &tracks[leg.track];
-                let samples = leg_samples(tracks, leg, axes.origin, axes.crotch);
+                let samples = axes.samples(tracks, leg);
                 chord(&samples, axes.origin, leg_radius(track, leg, place.radius))
             })
         })
@@ -276,7 +275,7 @@ impl Site<'_> {
             medial_point: self.place.position,
             axes_point: self.axes.point,
             plane_normal: plane.and_then(|[g, p, _]| plane_normal(directions[g]?, directions[p]?)),
-            crotch_mm: Some(self.axes.crotch),
+            crotch_mm: Some(self.axes.crotch()),
             branches: ids,
             angles,
             vmtk: None,
@@ -293,9 +292,8 @@ impl Site<'_> {
 
     /// Lines of all legs for windows that end at each distance of the grid.
     fn curves(&self) -> (Vec<f64>, Vec<Vec<Option<FittedLine>>>) {
-        let from = self.axes.windows.first().map_or(0.0, |w| w.0[0]);
-        let samples: Vec<_> =
-            self.place.legs.iter().map(|&l| leg_samples(self.tracks, l, self.axes.origin, self.axes.crotch)).collect();
+        let from = self.axes.windows.iter().map(|w| w.0[0]).fold(0.0, f64::max);
+        let samples: Vec<_> = self.place.legs.iter().map(|&l| self.axes.samples(self.tracks, l)).collect();
         let end = |leg: usize| {
             samples[leg].iter().filter(|s| s.usable).map(|s| s.distance).fold(0.0, f64::max) / self.diameter
         };
@@ -309,9 +307,10 @@ impl Site<'_> {
             directions.push(
                 samples
                     .iter()
+                    .zip(&self.axes.windows)
                     .zip(&ends)
-                    .map(|(s, &end)| {
-                        let fit = fit_window(s, from, d * self.diameter, WINDOW_MIN * self.diameter);
+                    .map(|((s, (window, _)), &end)| {
+                        let fit = fit_window(s, window[0], d * self.diameter, WINDOW_MIN * self.diameter);
                         fit.line.filter(|_| d <= end + GRID_DIAMETERS)
                     })
                     .collect(),
@@ -348,7 +347,7 @@ impl Site<'_> {
             warn(
                 "angles.axes_parallel",
                 format!(
-                    "fewer than two branches at junction {node} have lines that meet; distances are measured from the medial point"
+                    "the lines of the branches at junction {node} do not meet in it; distances are measured from the medial point"
                 ),
             );
         }
@@ -363,7 +362,8 @@ impl Site<'_> {
         if self.axes.moved {
             let message = format!(
                 "the lumens at junction {node} overlap up to {:.1} mm; the fit window, asked to end at {:.1} graft diameters, was moved out",
-                self.axes.crotch, settings.fit_to_diameters
+                self.axes.crotch(),
+                settings.fit_to_diameters
             );
             warn("angles.window_moved", message);
         }

@@ -59,6 +59,17 @@ impl Track {
         median(self.sections.iter().map(|s| s.radius_inscribed_mm).collect()).unwrap_or(0.0)
     }
 
+    /// Median inscribed radius outside the spheres at its ends, mm: the line of a thin branch runs in its trunk at first. The
+    /// smallest radius where nothing lies outside.
+    pub(crate) fn own_radius(&self) -> f64 {
+        let end = |s: Option<&Section>| s.map_or(0.0, |s| s.radius_inscribed_mm);
+        let (first, last) = (end(self.sections.first()), end(self.sections.last()));
+        let outside = |s: &&Section| s.abscissa_mm > first && self.length() - s.abscissa_mm > last;
+        let radii = self.sections.iter().filter(outside).map(|s| s.radius_inscribed_mm);
+        median(radii.collect())
+            .unwrap_or_else(|| self.sections.iter().map(|s| s.radius_inscribed_mm).fold(f64::INFINITY, f64::min))
+    }
+
     /// Whether a sample may enter a fit: closed, in one lumen, not within a radius of a blind tip.
     pub(crate) fn usable(&self, k: usize) -> bool {
         let s = &self.sections[k];

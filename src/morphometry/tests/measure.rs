@@ -561,3 +561,37 @@ fn a_thin_side_branch_near_a_junction_ends_no_window() {
         assert!((value - a.value_deg.unwrap()).abs() < 0.1, "{}: {value} for {:?}", a.name, a.value_deg);
     }
 }
+
+#[test]
+fn branches_that_bend_apart_part_where_their_lumens_do() {
+    // arteries of 3 mm that leave a trunk at 60 degrees and bend until 16 are left: tubes along their later axes would
+    // overlap up to 3 / tan 8 = 21 mm, from a point 10 mm up the trunk; the lumens part at about 3 / tan 30 = 5.2
+    let arm = |side: f64| {
+        let mut points = vec![DVec3::ZERO];
+        for k in 0..140 {
+            let s = 0.3 * f64::from(k);
+            let from_trunk = (30.0 - 22.0 * ((s - 6.0) / 9.0).clamp(0.0, 1.0)).to_radians();
+            points.push(points[points.len() - 1] + DVec3::new(side * from_trunk.sin(), 0.0, -from_trunk.cos()) * 0.3);
+        }
+        points
+    };
+    let trunk: Vec<DVec3> = (0..=120).map(|k| DVec3::Z * (0.3 * f64::from(k))).collect();
+    let mut case = Case { field: Tubes(Vec::new()), graph: MedialGraph::default(), cuts: Vec::new() };
+    case.graph.nodes.push(node(NodeKind::Junction, DVec3::ZERO, 4.0));
+    for (points, radius) in [(trunk, 4.0), (arm(1.0), 3.0), (arm(-1.0), 3.0)] {
+        let (last, before) = (points[points.len() - 1], points[points.len() - 2]);
+        let outward = (last - before).normalize();
+        case.cuts.push(CutPlane { point: P3::from_raw(last), outward: V3::from_raw(outward) });
+        add(&mut case.graph, 0, &points, radius);
+        let longer = points.iter().copied().chain([last + outward * 6.0]).collect();
+        case.field.0.push((longer, radius));
+    }
+    let m = run(&case, Roles::default()).unwrap();
+    let j = &m.junctions[0];
+    assert!(!codes(&m).contains(&"angles.unsettled"), "{:?}", m.warnings);
+    assert!(!codes(&m).contains(&"angles.window_moved"), "{:?}", m.warnings);
+    let crotch = j.crotch_mm.unwrap();
+    assert!((crotch - 3.0 / 30.0f64.to_radians().tan()).abs() < 0.6, "{crotch}");
+    let arms = j.angles.iter().filter_map(|a| a.value_deg).fold(f64::INFINITY, f64::min);
+    assert!((16.0..32.0).contains(&arms), "{arms} of {:?}", j.angles.iter().map(|a| a.value_deg).collect::<Vec<_>>());
+}
