@@ -117,6 +117,8 @@ pub(crate) struct LegPoint {
     /// Distance along the branch from the graph's node, mm.
     pub(crate) along: f64,
     pub(crate) point: DVec3,
+    /// Of the inscribed sphere, mm.
+    pub(crate) radius: f64,
 }
 
 /// The line of a leg from the graph's node outward, on past thin side branches.
@@ -131,7 +133,12 @@ pub(crate) fn leg_line(tracks: &[Track], leg: Leg) -> Vec<LegPoint> {
             let k = if piece.reversed { count - 1 - i } else { i };
             let s = &track.sections[k];
             let along = if piece.reversed { length - s.abscissa_mm } else { s.abscissa_mm };
-            items.push(LegPoint { section: [piece.track, k], along: before + along, point: s.position.raw() });
+            items.push(LegPoint {
+                section: [piece.track, k],
+                along: before + along,
+                point: s.position.raw(),
+                radius: s.radius_inscribed_mm,
+            });
         }
         before += length;
     }
@@ -153,7 +160,7 @@ fn leg_samples(tracks: &[Track], leg: Leg, origin: DVec3, inner: f64) -> Vec<Leg
     };
     (0..n)
         .map(|i| {
-            let LegPoint { section: [track, index], along, point } = items[i];
+            let LegPoint { section: [track, index], along, point, .. } = items[i];
             let distance = if i < first { straight(i) } else { along - start };
             let (before, after) = (items[i.saturating_sub(1)].along, items[(i + 1).min(n - 1)].along);
             let half = 0.25 * (after - before) * if i == 0 || i == n - 1 { 2.0 } else { 1.0 };

@@ -16,6 +16,7 @@ mod roles;
 mod section;
 mod track;
 mod types;
+mod vmtk;
 
 pub use angle::{Undefined, plane_normal};
 pub use crotch::crotch_distance;

@@ -5,12 +5,15 @@ use crate::angle::{Between, Undefined, named, plane_normal, triple};
 use crate::bands::{Varied, band95};
 use crate::fit::FittedLine;
 use crate::helix::fitted;
-use crate::junction::{Axes, FROM_CROTCH, Leg, Ruler, WINDOW_MIN, axes, chord, fit_window, flag, leg_radius, legs_at};
+use crate::junction::{
+    Axes, FROM_CROTCH, Leg, LegPoint, Ruler, WINDOW_MIN, axes, chord, fit_window, flag, leg_line, leg_radius, legs_at,
+};
 use crate::linear::median;
 use crate::roles::{Scope, Sites, assign};
 use crate::section::Lumen;
 use crate::track::{Track, curvature, finish, tracks};
-use crate::types::{Angle, Branch, ByDistance, Junction, Morphometry, Role, Settings, Stenosis};
+use crate::types::{Angle, Branch, ByDistance, Junction, Morphometry, Role, Settings, Stenosis, VmtkAngles};
+use crate::vmtk::{Ball, vmtk_angles};
 use exec::Ctx;
 use imaging::CutPlane;
 use implicit::{Draws, Field};
@@ -278,8 +281,21 @@ impl Site<'_> {
             crotch_mm: Some(self.axes.crotch()),
             branches: ids,
             angles,
-            vmtk: None,
+            vmtk: self.vmtk(),
         }
+    }
+
+    fn vmtk(&self) -> Option<VmtkAngles> {
+        let radius = |leg: &Leg| self.tracks[leg.track].own_radius();
+        let widest = || {
+            let legs = self.place.legs.iter().enumerate();
+            legs.max_by(|a, b| radius(a.1).total_cmp(&radius(b.1)).then(b.0.cmp(&a.0))).map(|(l, _)| l)
+        };
+        let inlet = self.roles.iter().position(|&r| r == Role::Proximal).or_else(widest)?;
+        let ball = |p: LegPoint| Ball { centre: p.point, radius: p.radius };
+        let line = |&leg: &Leg| leg_line(self.tracks, leg).into_iter().map(ball).collect();
+        let lines: Vec<Vec<Ball>> = self.place.legs.iter().map(line).collect();
+        vmtk_angles(&lines, inlet, self.tracks[self.place.legs[inlet].track].id)
     }
 
     /// The window that all legs of an angle have data in.

@@ -216,6 +216,8 @@ pub struct Angle {
 /// VMTK's bifurcation vectors, under its own convention.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct VmtkAngles {
+    /// The branch taken as the inlet, on which the angles depend: the proximal one where it is known, else the widest.
+    pub inlet: usize,
     /// In-plane angle per branch, degrees, in branch order.
     pub in_plane_deg: Vec<f64>,
     /// Out-of-plane angle per branch, degrees.

@@ -217,7 +217,11 @@ impl Fixture {
             crotch_mm: Some(7.2),
             branches: vec![0, 1, 2],
             angles: angles(),
-            vmtk: Some(VmtkAngles { in_plane_deg: vec![135.0, 0.0, 17.0], out_of_plane_deg: vec![1.0, 0.0, 15.0] }),
+            vmtk: Some(VmtkAngles {
+                inlet: 0,
+                in_plane_deg: vec![135.0, 0.0, 17.0],
+                out_of_plane_deg: vec![1.0, 0.0, 15.0],
+            }),
         };
         let warn = |code, text: &str, place| Warning::new(code, text, place);
         Self {

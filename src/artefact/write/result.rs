@@ -234,6 +234,7 @@ fn vmtk(v: &VmtkAngles) -> Json {
     Json::Object(vec![
         ("in_plane", Json::list(v.in_plane_deg.iter().copied())),
         ("out_of_plane", Json::list(v.out_of_plane_deg.iter().copied())),
+        ("inlet", v.inlet.into()),
     ])
 }
 

@@ -1,0 +1,207 @@
+//! A junction's angles as VMTK defines them (Antiga and Steinman, IEEE Trans Med Imaging 2004), for comparison with its
+//! tables: bifurcation vectors of one inscribed sphere's length next to the bifurcation, in its reference system.
+//!
+//! They depend on which branch is called the inlet, and a vector of one sphere's length sees the first bend only: a straight
+//! graft at 45 degrees is given as 45, 82 or 111 by inlet. So they are reported under their own name with their inlet, and
+//! nothing else in the result leans on them. Written from the published definition; the normal is that of the polygon's
+//! area (Newell), which is VMTK's where the four points lie in a plane.
+
+use crate::types::VmtkAngles;
+use space::DVec3;
+
+/// A centre of the medial line and the radius of its inscribed sphere, mm.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Ball {
+    pub(crate) centre: DVec3,
+    pub(crate) radius: f64,
+}
+
+impl Ball {
+    fn between(self, other: Self, t: f64) -> Self {
+        Self { centre: self.centre.lerp(other.centre, t), radius: self.radius + (other.radius - self.radius) * t }
+    }
+
+    /// Below zero inside the sphere.
+    fn value(self, x: DVec3) -> f64 {
+        x.distance_squared(self.centre) - self.radius * self.radius
+    }
+}
+
+/// A place on a line: segment and share of it.
+type At = (usize, f64);
+
+/// A line from the inlet through the junction to an outlet.
+struct Centreline(Vec<Ball>);
+
+impl Centreline {
+    fn ball(&self, (k, t): At) -> Ball {
+        self.0[k].between(self.0[k + 1], t)
+    }
+
+    /// Value of the canal surface about the line, below zero inside.
+    fn tube(&self, x: DVec3) -> f64 {
+        let of = |pair: &[Ball]| {
+            let along = pair[1].centre - pair[0].centre;
+            let square = along.length_squared();
+            let t = if square > 0.0 { ((x - pair[0].centre).dot(along) / square).clamp(0.0, 1.0) } else { 0.0 };
+            pair[0].between(pair[1], t).value(x)
+        };
+        self.0.windows(2).map(of).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Where a value along the line changes sign within a segment.
+    fn root(&self, k: usize, value: impl Fn(Ball) -> f64) -> At {
+        let sign = value(self.0[k]) > 0.0;
+        let (mut low, mut high) = (0.0, 1.0);
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            if (value(self.ball((k, middle))) > 0.0) == sign { low = middle } else { high = middle }
+        }
+        (k, 0.5 * (low + high))
+    }
+
+    /// Where the line leaves another's canal surface, at segment `from` or later.
+    fn leaves(&self, other: &Self, from: usize) -> Option<At> {
+        let value = |ball: Ball| other.tube(ball.centre);
+        let k = (from..self.0.len() - 1).find(|&k| value(self.0[k]) <= 0.0 && value(self.0[k + 1]) > 0.0)?;
+        Some(self.root(k, value))
+    }
+
+    /// The place whose sphere touches the centre of `at`, upstream or downstream.
+    fn touching(&self, at: At, upstream: bool) -> Option<At> {
+        let centre = self.ball(at).centre;
+        let value = |ball: Ball| ball.value(centre);
+        let crosses = |k: &usize| (value(self.0[*k]) > 0.0) != (value(self.0[*k + 1]) > 0.0);
+        let k = if upstream { (0..=at.0).find(crosses)? } else { (at.0..self.0.len() - 1).rev().find(crosses)? };
+        Some(self.root(k, value))
+    }
+}
+
+/// In-plane and out-of-plane angles of each leg's bifurcation vector, degrees, in the legs' order. `lines` run from the
+/// junction outward and share their first ball; `inlet` is a leg. `None` where a leg is shorter than a sphere.
+pub(crate) fn vmtk_angles(lines: &[Vec<Ball>], inlet: usize, inlet_branch: usize) -> Option<VmtkAngles> {
+    if lines.iter().any(|l| l.len() < 2) {
+        return None;
+    }
+    let outlets: Vec<usize> = (0..lines.len()).filter(|&l| l != inlet).collect();
+    let upstream = || lines[inlet].iter().rev().copied();
+    let centrelines: Vec<Centreline> =
+        outlets.iter().map(|&o| Centreline(upstream().chain(lines[o].iter().skip(1).copied()).collect())).collect();
+    let node = lines[inlet].len() - 1;
+    let mut tracts = Vec::new();
+    for (i, line) in centrelines.iter().enumerate() {
+        let mut last: Option<At> = None;
+        for (_, other) in centrelines.iter().enumerate().filter(|&(j, _)| j != i) {
+            let exit = line.leaves(other, node)?;
+            if last.is_none_or(|l| exit > l) {
+                last = Some(exit);
+            }
+        }
+        let exit = last?;
+        tracts.push((line.touching(exit, true)?, exit));
+    }
+    let normal = normal(&centrelines, &tracts)?;
+    let up = up_normal(&centrelines, &tracts, normal)?;
+
+    let mut vectors = vec![DVec3::ZERO; lines.len()];
+    vectors[inlet] = inlet_vector(&centrelines, &tracts)?;
+    for ((&outlet, line), &(_, exit)) in outlets.iter().zip(&centrelines).zip(&tracts) {
+        vectors[outlet] = line.ball(line.touching(exit, false)?).centre - line.ball(exit).centre;
+    }
+    let mut angles = VmtkAngles { inlet: inlet_branch, in_plane_deg: Vec::new(), out_of_plane_deg: Vec::new() };
+    for vector in vectors {
+        let unit = vector.try_normalize()?;
+        let in_plane = unit.reject_from_normalized(normal).try_normalize()?;
+        let sign = if in_plane.cross(up).dot(normal) < 0.0 { -1.0 } else { 1.0 };
+        angles.in_plane_deg.push(sign * in_plane.angle_between(up).to_degrees());
+        angles.out_of_plane_deg.push(90.0 - unit.angle_between(normal).to_degrees());
+    }
+    Some(angles)
+}
+
+/// Mean over the pairs of outlets of the normals of (touching, exit, exit, touching), made to agree.
+fn normal(lines: &[Centreline], tracts: &[(At, At)]) -> Option<DVec3> {
+    let mut normals: Vec<DVec3> = Vec::new();
+    for (i, (line, &(touching, exit))) in lines.iter().zip(tracts).enumerate() {
+        for (other, &(other_touching, other_exit)) in lines.iter().zip(tracts).skip(i + 1) {
+            let corners = [
+                line.ball(touching).centre,
+                line.ball(exit).centre,
+                other.ball(other_exit).centre,
+                other.ball(other_touching).centre,
+            ];
+            let area = (corners[2] - corners[0]).cross(corners[3] - corners[1]);
+            normals.push(area.try_normalize()?);
+        }
+    }
+    let first = *normals.first()?;
+    normals.iter().fold(DVec3::ZERO, |sum, &n| sum + n * n.dot(first).signum()).try_normalize()
+}
+
+/// Mean of the tracts' directions in the plane, by the squared radius where they leave.
+fn up_normal(lines: &[Centreline], tracts: &[(At, At)], normal: DVec3) -> Option<DVec3> {
+    let mut sum = DVec3::ZERO;
+    for (line, &(touching, exit)) in lines.iter().zip(tracts) {
+        let (first, last) = (line.ball(touching), line.ball(exit));
+        let in_plane = (last.centre - first.centre).reject_from_normalized(normal);
+        sum += in_plane.try_normalize()? * last.radius.powi(2);
+    }
+    sum.try_normalize()
+}
+
+/// From one sphere upstream of the bifurcation to its border, averaged over the lines by squared radius.
+fn inlet_vector(lines: &[Centreline], tracts: &[(At, At)]) -> Option<DVec3> {
+    let mut sums = [(DVec3::ZERO, 0.0); 2];
+    for (line, &(touching, _)) in lines.iter().zip(tracts) {
+        let balls = [line.ball(touching), line.ball(line.touching(touching, true)?)];
+        for (sum, ball) in sums.iter_mut().zip(balls) {
+            let weight = ball.radius.powi(2);
+            *sum = (sum.0 + ball.centre * weight, sum.1 + weight);
+        }
+    }
+    Some(sums[0].0 / sums[0].1 - sums[1].0 / sums[1].1)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn straight(direction: DVec3, radius: f64) -> Vec<Ball> {
+        (0..=200).map(|k| Ball { centre: direction.normalize() * (0.2 * f64::from(k)), radius }).collect()
+    }
+
+    #[test]
+    fn a_symmetric_fork_of_equal_tubes_has_its_own_angles() {
+        let (s, c) = 30.0f64.to_radians().sin_cos();
+        let lines =
+            [straight(-DVec3::Z, 3.0), straight(DVec3::new(s, 0.0, c), 3.0), straight(DVec3::new(-s, 0.0, c), 3.0)];
+        let angles = vmtk_angles(&lines, 0, 7).unwrap();
+        assert_eq!(angles.inlet, 7);
+        assert!(angles.in_plane_deg[0].abs() < 1e-9, "{angles:?}");
+        assert!((angles.in_plane_deg[1] + angles.in_plane_deg[2]).abs() < 1e-9, "{angles:?}");
+        assert!((angles.in_plane_deg[1].abs() - 30.0).abs() < 1e-9, "{angles:?}");
+        assert!(angles.out_of_plane_deg.iter().all(|a| a.abs() < 1e-9), "{angles:?}");
+    }
+
+    #[test]
+    fn a_leg_shorter_than_a_sphere_has_no_angles() {
+        let mut lines = [straight(-DVec3::Z, 3.0), straight(DVec3::X, 3.0), straight(DVec3::Z, 3.0)];
+        lines[1].truncate(8);
+        assert!(vmtk_angles(&lines, 0, 0).is_none());
+    }
+
+    #[test]
+    fn an_outlet_out_of_the_plane_of_the_others_is_told() {
+        let tilt = 20.0f64.to_radians();
+        let lines = [
+            straight(-DVec3::Z, 3.0),
+            straight(DVec3::new(1.0, 0.0, 1.0), 3.0),
+            straight(DVec3::new(-tilt.cos(), tilt.sin(), 1.0), 3.0),
+        ];
+        let angles = vmtk_angles(&lines, 0, 0).unwrap();
+        let [a, b] = [angles.out_of_plane_deg[1], angles.out_of_plane_deg[2]];
+        assert!(a.abs() < 12.0 && b.abs() < 12.0, "the plane is that of both outlets: {angles:?}");
+        assert!(angles.out_of_plane_deg[0].abs() > 1.0, "{angles:?}");
+    }
+}
