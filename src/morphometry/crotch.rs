@@ -4,9 +4,9 @@
 //! tubes along their later axes would: then the lumen itself tells where. Of the two the smaller is taken, so that a
 //! rounded crotch and its noise do not push out a window that the tubes would allow.
 
-use crate::junction::LegPoint;
+use crate::line::Polyline;
 use implicit::Field;
-use space::{DVec3, P3};
+use space::P3;
 
 /// Distance from the meeting point of two axes within which their lumens (round tubes of radii a and b, axes at
 /// `angle`, radians) overlap: the further of the two points where the wall lines cross, (r_b + r_a cos) / sin along a's
@@ -42,8 +42,8 @@ const STEP_MM: f64 = 0.25;
 /// The point of the crotch between two legs, as the lumen has it: where the last line of sight between points at equal
 /// distances along the two grazes the wall. The search begins at `from` mm, where they must see each other, and ends at
 /// `to`; `None` when they do not part within it.
-pub(crate) fn divider(field: &dyn Field, legs: [&[LegPoint]; 2], from: f64, to: f64) -> Option<P3> {
-    let pair = |s: f64| Some([P3::from_raw(at(legs[0], s)?), P3::from_raw(at(legs[1], s)?)]);
+pub(crate) fn divider(field: &dyn Field, legs: [&Polyline; 2], from: f64, to: f64) -> Option<P3> {
+    let pair = |s: f64| Some([P3::from_raw(legs[0].at(s)?), P3::from_raw(legs[1].at(s)?)]);
     let lowest = |[a, b]: [P3; 2]| {
         let looked = (0..=LOOKS).map(|i| a.lerp(b, i as f64 / LOOKS as f64)).map(|x| (field.value(x), x));
         looked.min_by(|x, y| x.0.total_cmp(&y.0))
@@ -65,15 +65,6 @@ pub(crate) fn divider(field: &dyn Field, legs: [&[LegPoint]; 2], from: f64, to: 
         if seen(middle)? { low = middle } else { high = middle }
     }
     lowest(pair(low)?).map(|(_, x)| x)
-}
-
-/// The point of a leg's line at a distance along it; `None` beyond its end.
-fn at(line: &[LegPoint], along: f64) -> Option<DVec3> {
-    let after = line.iter().position(|p| p.along >= along)?;
-    let (a, b) = (&line[after.saturating_sub(1)], &line[after]);
-    let span = b.along - a.along;
-    let t = if span > 0.0 { (along - a.along) / span } else { 0.0 };
-    Some(a.point.lerp(b.point, t.clamp(0.0, 1.0)))
 }
 
 #[cfg(test)]

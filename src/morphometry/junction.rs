@@ -7,6 +7,7 @@
 
 use crate::crotch::{divider, overlaps};
 use crate::fit::{FittedLine, fit_line, meeting_point};
+use crate::line::Polyline;
 use crate::track::Track;
 use implicit::Field;
 use space::{DVec3, P3, V3};
@@ -115,7 +116,7 @@ pub(crate) struct LegPoint {
     /// Its track, and its number on it.
     section: [usize; 2],
     /// Distance along the branch from the graph's node, mm.
-    pub(crate) along: f64,
+    along: f64,
     pub(crate) point: DVec3,
     /// Of the inscribed sphere, mm.
     pub(crate) radius: f64,
@@ -315,11 +316,15 @@ type Fits = (Vec<([f64; 2], WindowFit)>, bool, Vec<Option<V3>>);
 impl<'a> Meeting<'a> {
     fn new(tracks: &'a [Track], legs: &'a [Leg], field: &dyn Field, node_radius: f64) -> Self {
         let radii: Vec<f64> = legs.iter().map(|&l| leg_radius(&tracks[l.track], l, node_radius)).collect();
-        let lines: Vec<Vec<LegPoint>> = legs.iter().map(|&l| leg_line(tracks, l)).collect();
+        let line = |&leg: &Leg| {
+            let line = leg_line(tracks, leg);
+            Polyline { along: line.iter().map(|p| p.along).collect(), points: line.iter().map(|p| p.point).collect() }
+        };
+        let lines: Vec<Polyline> = legs.iter().map(line).collect();
         let reach = REACH_RADII * radii.iter().copied().fold(node_radius, f64::max);
         let pair = |i: usize, j: usize| {
             let crotch = divider(field, [&lines[i], &lines[j]], node_radius, reach)?.raw();
-            Some([i, j].map(|leg| nearest(&lines[leg], crotch)))
+            Some([i, j].map(|leg| lines[leg].nearest(crotch)))
         };
         let partings = (0..legs.len()).map(|i| (0..i).map(|j| pair(i, j)).collect()).collect();
         Self { tracks, legs, radii, partings }
@@ -367,17 +372,6 @@ impl<'a> Meeting<'a> {
         }
         reach
     }
-}
-
-/// The point of a leg's line that is nearest to `x`.
-fn nearest(line: &[LegPoint], x: DVec3) -> DVec3 {
-    let on = |pair: &[LegPoint]| {
-        let (a, b) = (pair[0].point, pair[1].point);
-        let square = (b - a).length_squared();
-        let t = if square > 0.0 { ((x - a).dot(b - a) / square).clamp(0.0, 1.0) } else { 0.0 };
-        a.lerp(b, t)
-    };
-    line.windows(2).map(on).min_by(|a, b| a.distance(x).total_cmp(&b.distance(x))).unwrap_or(x)
 }
 
 /// Flags the sections of each leg within which its lumen overlaps with another's.

@@ -107,6 +107,29 @@ pub(crate) fn nearest(points: &[DVec3], p: DVec3) -> (f64, usize, f64) {
     best
 }
 
+/// Points with their distances along the line, ascending; two at least.
+pub(crate) struct Polyline {
+    pub(crate) along: Vec<f64>,
+    pub(crate) points: Vec<DVec3>,
+}
+
+impl Polyline {
+    /// The point at a distance along the line; `None` beyond its end.
+    pub(crate) fn at(&self, along: f64) -> Option<DVec3> {
+        let within = self.along.last().is_some_and(|&end| along <= end);
+        within.then(|| {
+            let (i, t) = locate(&self.along, along);
+            self.points[i].lerp(self.points[i + 1], t)
+        })
+    }
+
+    /// The point nearest to `x`.
+    pub(crate) fn nearest(&self, x: DVec3) -> DVec3 {
+        let (_, i, t) = nearest(&self.points, x);
+        self.points[i].lerp(self.points[i + 1], t)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]

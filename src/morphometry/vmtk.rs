@@ -3,9 +3,11 @@
 //!
 //! They depend on which branch is called the inlet, and a vector of one sphere's length sees the first bend only: a straight
 //! graft at 45 degrees is given as 45, 82 or 111 by inlet. So they are reported under their own name with their inlet, and
-//! nothing else in the result leans on them. Written from the published definition; the normal is that of the polygon's
-//! area (Newell), which is VMTK's where the four points lie in a plane.
+//! nothing else in the result leans on them. The steps are those of VMTK's vtkvmtkCenterlineBranchExtractor,
+//! -BifurcationReferenceSystems and -BifurcationVectors, read in its source and written anew; one differs: the normal is that
+//! of the polygon's area (Newell), which is VMTK's where the four points lie in a plane.
 
+use crate::line::nearest;
 use crate::types::VmtkAngles;
 use space::DVec3;
 
@@ -41,9 +43,7 @@ impl Centreline {
     /// Value of the canal surface about the line, below zero inside.
     fn tube(&self, x: DVec3) -> f64 {
         let of = |pair: &[Ball]| {
-            let along = pair[1].centre - pair[0].centre;
-            let square = along.length_squared();
-            let t = if square > 0.0 { ((x - pair[0].centre).dot(along) / square).clamp(0.0, 1.0) } else { 0.0 };
+            let (_, _, t) = nearest(&[pair[0].centre, pair[1].centre], x);
             pair[0].between(pair[1], t).value(x)
         };
         self.0.windows(2).map(of).fold(f64::INFINITY, f64::min)
@@ -90,14 +90,9 @@ pub(crate) fn vmtk_angles(lines: &[Vec<Ball>], inlet: usize, inlet_branch: usize
     let node = lines[inlet].len() - 1;
     let mut tracts = Vec::new();
     for (i, line) in centrelines.iter().enumerate() {
-        let mut last: Option<At> = None;
-        for (_, other) in centrelines.iter().enumerate().filter(|&(j, _)| j != i) {
-            let exit = line.leaves(other, node)?;
-            if last.is_none_or(|l| exit > l) {
-                last = Some(exit);
-            }
-        }
-        let exit = last?;
+        let others = centrelines.iter().enumerate().filter(|&(j, _)| j != i);
+        let exits: Vec<At> = others.map(|(_, other)| line.leaves(other, node)).collect::<Option<_>>()?;
+        let exit = exits.into_iter().max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)))?;
         tracts.push((line.touching(exit, true)?, exit));
     }
     let normal = normal(&centrelines, &tracts)?;
