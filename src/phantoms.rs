@@ -64,8 +64,17 @@ pub(crate) fn folder(kind: Kind, settings: &Settings, out: &Path) -> Result<()> 
     fs::write(out.join("scan.mha"), artefact::write::metaimage::volume(&stack)?)?;
     let plan = Plan { roles: roles(&truth), ..Plan::default() };
     fs::write(out.join("plan.json"), plan_json(&plan)?)?;
-    fs::write(out.join("truth.json"), format!("{:#}\n", truth_json(&truth)))?;
+    let mut told = truth_json(&truth);
+    told["scan"] = scan_json(settings);
+    fs::write(out.join("truth.json"), format!("{told:#}\n"))?;
     Ok(())
+}
+
+/// How the scan was taken: mm, SNR as in the settings, null without noise.
+fn scan_json(settings: &Settings) -> Value {
+    json!({"pixel_mm": settings.pixel_mm, "slice_spacing_mm": settings.slice_spacing_mm,
+           "thickness_mm": settings.thickness_mm, "snr": settings.snr, "psf_sigma_px": settings.psf_sigma_px,
+           "distractors": settings.distractors, "seed": settings.seed})
 }
 
 fn write_files(folder: &Path, files: Vec<artefact::read::NamedBytes>) -> Result<()> {

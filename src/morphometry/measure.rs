@@ -220,6 +220,17 @@ fn rough_directions(tracks: &[Track], place: &Spot, axes: &Axes) -> Vec<Option<V
         .collect()
 }
 
+/// What all spans have in common; where one ends before another begins (each leg's window starts at its own crotch), the
+/// stretch that they lie in together.
+fn common_window(spans: &[[f64; 2]]) -> [f64; 2] {
+    let (starts, ends) = (spans.iter().map(|s| s[0]), spans.iter().map(|s| s[1]));
+    let common = [starts.clone().fold(0.0, f64::max), ends.clone().fold(f64::INFINITY, f64::min)];
+    if common[0] < common[1] {
+        return common;
+    }
+    [starts.fold(f64::INFINITY, f64::min), ends.fold(0.0, f64::max)]
+}
+
 /// Diameter of the graft, mm; of the median branch where no leg is the graft.
 fn graft_diameter(tracks: &[Track], place: &Spot, roles: &[Role]) -> f64 {
     let of = |leg: &Leg| {
@@ -298,12 +309,15 @@ impl Site<'_> {
         vmtk_angles(&lines, inlet, self.tracks[self.place.legs[inlet].track].id)
     }
 
-    /// The window that all legs of an angle have data in.
+    /// The window that all legs of an angle have data in, graft diameters.
     fn window(&self, between: Between) -> [f64; 2] {
-        let legs = between.legs();
-        let from = legs.iter().map(|&l| self.axes.windows[l].0[0]).fold(0.0, f64::max);
-        let to = legs.iter().map(|&l| self.axes.windows[l].1.to).fold(f64::INFINITY, f64::min);
-        [from / self.diameter, to / self.diameter]
+        let spans: Vec<[f64; 2]> = between
+            .legs()
+            .iter()
+            .map(|&l| &self.axes.windows[l])
+            .map(|(window, fit)| [window[0] / self.diameter, fit.to / self.diameter])
+            .collect();
+        common_window(&spans)
     }
 
     /// Lines of all legs for windows that end at each distance of the grid.
@@ -511,5 +525,16 @@ fn warn_sections(tracks: &[Track], warnings: &mut Vec<Warning>) {
             );
             warnings.push(Warning::new("sections.outside", message, Place::element(t.id)));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::common_window;
+
+    #[test]
+    fn a_window_never_ends_before_it_begins() {
+        assert_eq!(common_window(&[[1.0, 4.0], [2.0, 5.0], [0.5, 3.0]]), [2.0, 3.0]);
+        assert_eq!(common_window(&[[1.0, 2.0], [3.0, 4.0]]), [1.0, 4.0]);
     }
 }

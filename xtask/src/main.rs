@@ -2,6 +2,7 @@
 
 mod bench;
 mod check;
+mod drawn;
 mod fuzz;
 mod shell;
 mod storm;
@@ -32,11 +33,11 @@ enum Command {
     },
     /// Install what the tests need, then run every check.
     Test,
-    /// Reconstruct many simulated scans and compare them with the truth.
+    /// Reconstruct many simulated scans and compare them with the truth: ten noise seeds of the demo scan, or random vessels.
     Survey {
-        /// Number of noise seeds.
-        #[arg(long, default_value_t = 10)]
-        count: u64,
+        /// Number of random vessels, each with a scan of its own resolution and noise.
+        #[arg(long)]
+        count: Option<u64>,
         /// First seed.
         #[arg(long, default_value_t = 1)]
         first: u64,
@@ -90,7 +91,8 @@ fn run(command: Command) -> Result<()> {
     match command {
         Command::Demo { seed, keep } => demo(seed, keep),
         Command::Test => check::all(),
-        Command::Survey { count, first } => survey::run(&tools::release_binary()?, first, count),
+        Command::Survey { count: None, first } => survey::run(&tools::release_binary()?, first, 10),
+        Command::Survey { count: Some(count), first } => drawn::run(&tools::release_binary()?, first, count),
         Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
