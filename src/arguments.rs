@@ -20,6 +20,8 @@ pub(crate) enum Command {
     Work(Serve),
     /// The whole reconstruction without a service.
     Run(Run),
+    /// Change the medial lines of a finished reconstruction and make the vessels anew around them.
+    Vary(Vary),
     /// Read and check a scan and a plan; nothing is reconstructed.
     Validate(Validate),
     /// A simulated scan with exact truth: DICOM, PNG + plan, NIfTI, truth.json.
@@ -159,6 +161,43 @@ pub(crate) struct Run {
     #[arg(long)]
     pub(crate) threads: Option<usize>,
     /// Results and errors as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Vary {
+    /// Folder of a finished reconstruction, or its sections.json.
+    pub(crate) source: PathBuf,
+    /// Folder for the variants, one folder each.
+    #[arg(long)]
+    pub(crate) out: PathBuf,
+    /// BRANCH=DEGREES[,DEGREES...]: turned until the branch makes this angle with the proximal one (BRANCH:OTHER=... with
+    /// another). BRANCH is graft, proximal, distal, host_a, host_b or a number. Several values make a series.
+    #[arg(long, value_name = "BRANCH=DEG")]
+    pub(crate) angle: Vec<String>,
+    /// BRANCH=FACTOR[,FACTOR...]: every bend times a factor.
+    #[arg(long, value_name = "BRANCH=FACTOR")]
+    pub(crate) bend: Vec<String>,
+    /// BRANCH=CURVATURE[,CURVATURE...]: constant curvature, 1/mm.
+    #[arg(long, value_name = "BRANCH=PER_MM")]
+    pub(crate) curvature: Vec<String>,
+    /// BRANCH=TORSION[,TORSION...]: with --curvature, constant torsion, 1/mm, positive right-handed.
+    #[arg(long, value_name = "BRANCH=PER_MM", allow_hyphen_values = true)]
+    pub(crate) torsion: Vec<String>,
+    /// BRANCH: straightened.
+    #[arg(long, value_name = "BRANCH")]
+    pub(crate) straight: Vec<String>,
+    /// BRANCH: pressed into its junction's plane.
+    #[arg(long, value_name = "BRANCH")]
+    pub(crate) planar: Vec<String>,
+    /// plan.json; its `variant`, if any, is one more variant.
+    #[arg(long)]
+    pub(crate) plan: Option<PathBuf>,
+    /// Threads (default: all cores; the bytes do not depend on it).
+    #[arg(long)]
+    pub(crate) threads: Option<usize>,
+    /// Results and errors as JSON, one line a variant.
     #[arg(long)]
     pub(crate) json: bool,
 }

@@ -94,11 +94,11 @@ fn die_with_parent() {
     });
 }
 
-fn context(threads: Option<usize>) -> Result<Ctx, Failure> {
+pub(crate) fn context(threads: Option<usize>) -> Result<Ctx, Failure> {
     Ctx::new(threads.unwrap_or(0)).map_err(Failure::internal)
 }
 
-fn plan_of(path: Option<&Path>) -> Result<Plan, Failure> {
+pub(crate) fn plan_of(path: Option<&Path>) -> Result<Plan, Failure> {
     let Some(path) = path else { return Ok(Plan::default()) };
     let bytes = std::fs::read(path).map_err(|e| Failure::unreadable(path, &e))?;
     Plan::parse(&bytes).map_err(Failure::plan)
@@ -110,7 +110,7 @@ fn problem(failure: &Failure) -> Problem {
     Problem::of_all(all).unwrap_or_else(|| Problem::of(failure))
 }
 
-fn report(failure: &Failure, as_json: bool) -> ExitCode {
+pub(crate) fn report(failure: &Failure, as_json: bool) -> ExitCode {
     if as_json {
         eprintln!("{}", json!(problem(failure)));
     } else {
@@ -119,7 +119,7 @@ fn report(failure: &Failure, as_json: bool) -> ExitCode {
     ExitCode::from(failure.kind.exit_code())
 }
 
-fn summary(result: &Value, out: &Path) -> String {
+pub(crate) fn summary(result: &Value, out: &Path) -> String {
     let mut text = table::angles(result, None);
     for warning in result["warnings"].as_array().map(Vec::as_slice).unwrap_or_default() {
         text += &format!(
@@ -151,19 +151,19 @@ fn words(value: &Value, depth: usize) -> String {
 }
 
 /// A bar on a terminal, one line per stage elsewhere.
-struct Shown {
+pub(crate) struct Shown {
     bar: Option<ProgressBar>,
     stage: Mutex<String>,
 }
 
 impl Shown {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %")
             .unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(1000).with_style(style));
         Self { bar, stage: Mutex::default() }
     }
-    fn show(&self, e: &Event<'_>) {
+    pub(crate) fn show(&self, e: &Event<'_>) {
         let Ok(mut stage) = self.stage.lock() else { return };
         let is_new = *stage != e.stage;
         if is_new {
@@ -179,7 +179,7 @@ impl Shown {
             None => {}
         }
     }
-    fn finish(&self) {
+    pub(crate) fn finish(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }

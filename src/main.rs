@@ -6,6 +6,7 @@ mod jobs;
 mod phantoms;
 mod serving;
 mod table;
+mod variants;
 
 use arguments::{Arguments, Command};
 use clap::Parser;
@@ -16,6 +17,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     match arguments.command {
         Command::Run(a) => jobs::run(&a),
+        Command::Vary(a) => variants::vary(&a),
         Command::Validate(a) => jobs::validate(&a),
         Command::ExecJob(a) => jobs::exec(&a),
         Command::Phantom(a) => phantoms::write(&a),

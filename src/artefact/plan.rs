@@ -7,6 +7,7 @@ mod check;
 mod convert;
 #[cfg(test)]
 mod tests;
+mod variant;
 
 pub use check::{PlanFault, PlanFaults};
 
@@ -37,6 +38,55 @@ pub struct Plan {
     pub morphometry: Morphometry,
     /// What to make: `surface`, `skeleton`, `volume`. Empty or absent: surface and skeleton.
     pub outputs: Vec<String>,
+    /// A re-synthesis: the input is then the sections.json of a finished reconstruction.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub variant: Option<Variant>,
+}
+
+/// A vessel tree with changed medial lines.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Variant {
+    /// What is changed, one after the other; nothing: the tree as it was measured.
+    pub changes: Vec<VariantChange>,
+}
+
+/// What is changed of one branch: exactly one of `angle_deg`, `curvature_factor`, `curvature_per_mm`, `straight`, `planar`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct VariantChange {
+    /// The branch.
+    pub branch: Branch,
+    /// Wanted angle against `to`, degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub angle_deg: Option<f64>,
+    /// The branch that the angle is measured against; for the graft the proximal one where it is not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub to: Option<Branch>,
+    /// Factor on every bend.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub curvature_factor: Option<f64>,
+    /// Constant curvature.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub curvature_per_mm: Option<f64>,
+    /// Constant torsion with it, positive right-handed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub torsion_per_mm: Option<f64>,
+    /// Straightened.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub straight: Option<bool>,
+    /// Pressed into the junction's plane.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub planar: Option<bool>,
+}
+
+/// A branch, by its number or its role.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Branch {
+    /// Number in result.json.
+    Id(usize),
+    /// `graft`, `proximal`, `distal`, `host_a` or `host_b`.
+    Role(String),
 }
 
 /// Geometry of images that carry none, LPS mm.

@@ -6,6 +6,7 @@
 //! [`Provenance`](crate::write::Provenance) alone, so that every artefact made from a `Reconstruction` is the same to
 //! the byte from run to run.
 
+use crate::plan::Variant;
 use imaging::Contours;
 use morphometry::{Junction, Morphometry, Role};
 use skeleton::MedialGraph;
@@ -33,6 +34,8 @@ pub struct Reconstruction<'a> {
     pub warnings: &'a [Warning],
     /// Up to three grey slices with the contours on them, for the report.
     pub pictures: Vec<SlicePicture>,
+    /// What was changed, where this is a re-synthesis and no scan.
+    pub variant: Option<Variant>,
 }
 
 impl Reconstruction<'_> {

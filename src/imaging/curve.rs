@@ -87,13 +87,54 @@ pub struct CurvePoint {
     pub standard_error_mm: f64,
 }
 
-/// The data end here: everything on the `outward` side of the plane is outside the scan. The surface is cut here.
+/// The data end here: what lies on the `outward` side of the plane within `reach_mm` of `point` is outside. The surface is
+/// cut here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CutPlane {
     /// A point of the plane.
     pub point: P3,
     /// Unit normal away from the data.
     pub outward: V3,
+    /// Infinite where a scan ends; finite for a cut across one vessel of a tree, which leaves the others whole. The lumen
+    /// past such a plane must close within the ball.
+    pub reach_mm: f64,
+}
+
+impl CutPlane {
+    /// Everything on the `outward` side is outside.
+    pub fn new(point: P3, outward: V3) -> Self {
+        Self { point, outward, reach_mm: f64::INFINITY }
+    }
+
+    /// A cut across one vessel: only what lies within `reach_mm` of `point` is cut.
+    pub fn within(self, reach_mm: f64) -> Self {
+        Self { reach_mm, ..self }
+    }
+
+    /// Height over the plane, mm, positive outside; minus infinity out of its reach.
+    pub fn height(&self, x: P3) -> f64 {
+        let from = x - self.point;
+        if self.reaches(x) { from.dot(self.outward) } else { f64::NEG_INFINITY }
+    }
+
+    /// Whether a point lies past the cut.
+    pub fn excludes(&self, x: P3) -> bool {
+        self.height(x) > 0.0
+    }
+
+    /// Where a ray of unit direction from a point that is not past the cut passes it, mm; 0 from a point that is past.
+    pub fn passed_at(&self, from: P3, direction: V3) -> Option<f64> {
+        if self.excludes(from) {
+            return Some(0.0);
+        }
+        let speed = direction.dot(self.outward);
+        let t = (self.point - from).dot(self.outward) / speed;
+        (speed > 0.0 && t >= 0.0 && self.reaches(from + direction * t)).then_some(t)
+    }
+
+    fn reaches(&self, x: P3) -> bool {
+        self.reach_mm == f64::INFINITY || x.distance(self.point) <= self.reach_mm
+    }
 }
 
 /// A lumen that ends between two planes inside the volume.

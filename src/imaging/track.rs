@@ -53,10 +53,10 @@ fn cuts(drawn: &[Drawn], planes: &[Plane]) -> Vec<CutPlane> {
     let present = |index: usize| drawn.iter().flat_map(|d| &d.outlines).any(|o| o.plane == index);
     if let [first, .., last] = planes {
         if present(first.index) {
-            out.push(CutPlane { point: first.origin, outward: -first.normal() });
+            out.push(CutPlane::new(first.origin, -first.normal()));
         }
         if present(last.index) {
-            out.push(CutPlane { point: last.origin, outward: last.normal() });
+            out.push(CutPlane::new(last.origin, last.normal()));
         }
     }
     let Some(plane) = planes.first() else { return out };
@@ -65,7 +65,7 @@ fn cuts(drawn: &[Drawn], planes: &[Plane]) -> Vec<CutPlane> {
         let on = |o: &crate::draw::Outline| o.line.points.iter().zip(&o.line.border).any(|(p, &b)| b && p[axis] == at);
         if drawn.iter().flat_map(|d| &d.outlines).any(on) {
             let uv = if axis == 0 { [at, 0.0] } else { [0.0, at] };
-            out.push(CutPlane { point: plane.to_patient(uv), outward });
+            out.push(CutPlane::new(plane.to_patient(uv), outward));
         }
     }
     out

@@ -183,8 +183,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
     let polygons = polygons(contours, curve.plane);
     // at the end planes the first function already closes: its bend along the vessel is not the wall's
     let at_end = contours.cuts.iter().any(|cut| {
-        cut.outward.dot(plane.normal()).abs() > 0.999
-            && (plane.origin - cut.point).dot(cut.outward).abs() < 1e-3 * contours.pixel_mm
+        cut.outward.dot(plane.normal()).abs() > 0.999 && cut.height(plane.origin).abs() < 1e-3 * contours.pixel_mm
     });
     let mut out = Vec::with_capacity(count);
     let mut k = 0;
@@ -299,9 +298,9 @@ fn push_closing(contours: &Contours, settings: &Settings, c: &mut Constraints) {
         for cut in &contours.cuts {
             let parallel = cut.outward.dot(plane.normal()).abs() > 0.999;
             let touching = if parallel {
-                ((centre - cut.point).dot(cut.outward).abs() < 1e-3 * contours.pixel_mm).then_some(centre)
+                (cut.height(centre).abs() < 1e-3 * contours.pixel_mm).then_some(centre)
             } else {
-                border_middle(curve, plane).filter(|m| (*m - cut.point).dot(cut.outward) > -contours.pixel_mm)
+                border_middle(curve, plane).filter(|m| cut.height(*m) > -contours.pixel_mm)
             };
             if let Some(at) = touching {
                 push(at + cut.outward * (2.0 * radius), radius);

@@ -12,6 +12,7 @@ mod junction;
 mod line;
 mod linear;
 mod measure;
+mod resynthesis;
 mod roles;
 mod section;
 mod track;
@@ -24,8 +25,11 @@ pub use error::Error;
 pub use fit::{FittedLine, fit_line, meeting_point};
 pub use helix::fit_helix;
 pub use measure::{measure, measure_with_bands};
+pub use resynthesis::{
+    Change, Model, ModelBranch, ModelJunction, ModelSection, Resynthesis, What, Which, resynthesise,
+};
 pub use section::{Cut, Lumen, Outline, RAYS};
 pub use types::{
-    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Roles, Section, Settings, Stenosis,
-    VmtkAngles,
+    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Roles, Section, SectionOutline, Settings,
+    Stenosis, VmtkAngles,
 };

@@ -7,7 +7,7 @@
 use crate::Error;
 use crate::line::{Samples, arc_length, locate};
 use crate::linear::{median, positive};
-use crate::section::{Cut, Lumen, Outline, RAYS, RAYS_COARSE};
+use crate::section::{Cut, Lumen, Outline, RAYS, RAYS_COARSE, closed, outline};
 use crate::types::Section;
 use exec::Ctx;
 use skeleton::{MedialGraph, NodeKind};
@@ -248,21 +248,24 @@ fn cut_all(tracks: &mut [Track], lumen: Lumen<'_>, rays: usize, ctx: &Ctx) -> Re
         tracks.iter().enumerate().flat_map(|(t, track)| (0..track.sections.len()).map(move |k| (t, k))).collect();
     let cuts = ctx.map(&items, |&(t, k)| {
         let s = &tracks[t].sections[k];
-        let cut = lumen.section(s.position, s.tangent, s.radius_inscribed_mm, rays);
+        let wall = lumen.rays(s.position, s.tangent, s.radius_inscribed_mm, rays);
+        let outline = wall.as_ref().ok().filter(|_| rays == RAYS).and_then(|w| outline(s.position, w));
+        let cut = wall.map_or_else(|cut| cut, |w| closed(s.position.raw(), &w));
         let inscribed = match cut {
             Cut::Closed(Outline { shortest, .. }) if rays == RAYS => {
                 lumen.inscribed_radius(s.position, shortest, s.radius_inscribed_mm)
             }
             _ => None,
         };
-        (cut, inscribed)
+        (cut, inscribed, outline)
     })?;
     for t in tracks.iter_mut() {
         t.outside = 0;
     }
-    for (&(t, k), (cut, inscribed)) in items.iter().zip(cuts) {
+    for (&(t, k), (cut, inscribed, outline)) in items.iter().zip(cuts) {
         let centre = if tracks[t].sections[k].in_junction { Centre::Keep } else { Centre::Move };
         tracks[t].take(k, cut, inscribed, centre);
+        tracks[t].sections[k].outline = outline.filter(|_| !tracks[t].leak[k]);
     }
     Ok(())
 }
@@ -351,6 +354,7 @@ fn smoothed(id: usize, nodes: [usize; 2], tip: [bool; 2], at: &[f64], sampled: &
             shape: None,
             area_error_mm2: None,
             curvature_error_per_mm: None,
+            outline: None,
             in_junction: false,
             open: false,
         });

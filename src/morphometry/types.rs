@@ -61,6 +61,24 @@ impl Role {
             Self::Other => "other",
         }
     }
+
+    /// The inverse of [`Role::name`].
+    pub fn named(name: &str) -> Option<Self> {
+        [Self::Graft, Self::Proximal, Self::Distal, Self::HostA, Self::HostB, Self::Other]
+            .into_iter()
+            .find(|r| r.name() == name)
+    }
+}
+
+/// The wall around a section: rays at even angles within the plane normal to its tangent.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SectionOutline {
+    /// Where the rays start (within 5 % of a radius of the area centroid).
+    pub centre: P3,
+    /// Unit direction of the first ray; the others follow counterclockwise about the tangent.
+    pub first: V3,
+    /// Lengths of the rays, mm.
+    pub radii_mm: Vec<f64>,
 }
 
 /// One cross-section normal to the medial line. `None` where it could not be measured (open, leaking).
@@ -86,6 +104,8 @@ pub struct Section {
     pub area_error_mm2: Option<f64>,
     /// Standard error of the curvature, 1/mm.
     pub curvature_error_per_mm: Option<f64>,
+    /// The wall; `None` where the area is, or where it leaks into another lumen.
+    pub outline: Option<SectionOutline>,
     /// The lumens of several branches overlap here.
     pub in_junction: bool,
     /// The section is not closed within the data (near an end).

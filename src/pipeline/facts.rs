@@ -35,6 +35,12 @@ pub(crate) fn segmentation(contours: &Contours, r: &imaging::Report) -> Segmenta
     }
 }
 
+/// A re-synthesis has rings across its branches and no pixels.
+pub(crate) fn rings(contours: &Contours) -> SegmentationFacts {
+    let contours = contours.curves.len();
+    SegmentationFacts { contours, axis: "branch".to_owned(), ..SegmentationFacts::default() }
+}
+
 fn axis(axis: Axis) -> &'static str {
     match axis {
         Axis::Slice => "slice",

@@ -5,6 +5,7 @@ mod facts;
 mod failure;
 mod folder;
 mod reconstruct;
+mod source;
 mod step;
 
 pub use failure::Failure;

@@ -1,8 +1,8 @@
 //! From a scan to all artefacts.
 
-use crate::facts;
 use crate::step::{Steps, peak_memory_bytes};
 use crate::{Failure, Observer, folder};
+use crate::{facts, source};
 use artefact::plan::Plan;
 use artefact::read::{InputReport, Limits};
 use artefact::write::{self, NamedBytes, Provenance};
@@ -18,9 +18,6 @@ use std::path::{Path, PathBuf};
 use surface::{
     Bounded, Displacement, Extension, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh,
 };
-
-/// Draws from the fit's posterior for the 95 % bands: their standard deviation is known to 1 / sqrt(2 * 24) = 14 %.
-const DRAWS: usize = 24;
 
 /// The surface with all that is known of it.
 pub(crate) struct Wall {
@@ -62,33 +59,37 @@ fn reconstruct(
     refuse_unmade(plan)?;
     let mut steps = Steps::new(ctx, observer);
 
-    let (stack, input) = steps.step("read", |_| artefact::read::stack(inputs, plan, &Limits::default()))?;
-    let (contours, segmentation) =
-        steps.step("contours", |ctx| imaging::contours(&stack, &input.imaging(plan), ctx))?;
+    let source = match &plan.variant {
+        None => source::scanned(inputs, plan, &mut steps)?,
+        Some(variant) => source::changed(inputs, plan, variant, &mut steps)?,
+    };
+    let (contours, plan) = (source.contours, &source.plan);
     let (f, fit, ensemble) =
-        steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &fit_settings(), DRAWS, ctx))?;
+        steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &fit_settings(), source.draws, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
     let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
     let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
     let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
     let morphometry = steps.step("measure", |ctx| {
-        let (draws, settings): (Option<&dyn Draws>, _) = (Some(&ensemble), plan.morphometry());
-        morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &settings, ctx)
+        let draws: Option<&dyn Draws> = if source.draws > 0 { Some(&ensemble) } else { None };
+        morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &plan.morphometry(), ctx)
     })?;
 
-    let read = told(&input, Some(&segmentation)).cloned();
-    let warnings: Vec<Warning> = read.chain(wall.warnings.clone()).chain(medial.warnings).collect();
+    let told = source.warnings.into_iter();
+    let warnings: Vec<Warning> = told.chain(wall.warnings.clone()).chain(medial.warnings).collect();
+    let digest = source.input.digest.clone();
     let mut files = steps.step("write", |_| {
         let reconstruction = Reconstruction {
-            input: facts::input(&input),
-            segmentation: facts::segmentation(&contours, &segmentation),
+            input: source.input,
+            segmentation: source.segmentation,
             contours: &contours,
             implicit: facts::implicit(&fit),
             surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry),
             graph: &graph,
             morphometry: &morphometry,
             warnings: &warnings,
-            pictures: write::slice_pictures(&stack, &contours)?,
+            pictures: source.pictures,
+            variant: plan.variant.clone(),
         };
         let mut files = write::write_all(&reconstruction)?;
         files.extend(write::write_asked(&reconstruction, &plan.outputs)?);
@@ -105,7 +106,7 @@ fn reconstruct(
         threads: ctx.threads(),
         started_at,
         finished_at: Some(facts::now_utc()),
-        input_digest: input.digest,
+        input_digest: digest,
         plan: plan.clone(),
         stages: steps.times.iter().map(facts::stage).collect(),
         peak_memory_bytes: Some(peak_memory_bytes()),
@@ -188,7 +189,7 @@ struct Image {
 
 /// Wall points on the inner side of every cut plane: only there is the wall known.
 fn within(contours: &Contours, points: &[P3]) -> Vec<P3> {
-    let inside = |p: &&P3| contours.cuts.iter().all(|c| (**p - c.point).dot(c.outward) <= 0.0);
+    let inside = |p: &&P3| contours.cuts.iter().all(|c| !c.excludes(**p));
     points.iter().filter(inside).copied().collect()
 }
 
@@ -439,7 +440,10 @@ fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imag
 
 /// The reader's and the segmentation's warnings. Both tell gaps: the segmentation knows also those of slices that the plan
 /// leaves out, so that its word is the one to keep.
-fn told<'a>(input: &'a InputReport, found: Option<&'a imaging::Report>) -> impl Iterator<Item = &'a Warning> {
+pub(crate) fn told<'a>(
+    input: &'a InputReport,
+    found: Option<&'a imaging::Report>,
+) -> impl Iterator<Item = &'a Warning> {
     let later = found.map_or(&[][..], |r| &r.warnings);
     let again = move |w: &&Warning| w.code == "stack.gap" && later.iter().any(|l| l.code == w.code);
     input.warnings.iter().filter(move |w| !again(w)).chain(later)

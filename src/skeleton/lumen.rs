@@ -124,14 +124,7 @@ impl<'a> Lumen<'a> {
     }
 
     fn cut_distance(&self, from: P3, direction: V3) -> f64 {
-        let mut nearest = f64::INFINITY;
-        for cut in self.domain.cuts {
-            let speed = direction.dot(cut.outward);
-            if speed > 1e-9 {
-                nearest = nearest.min(((cut.point - from).dot(cut.outward) / speed).max(0.0));
-            }
-        }
-        nearest
+        self.domain.cuts.iter().filter_map(|cut| cut.passed_at(from, direction)).fold(f64::INFINITY, f64::min)
     }
 
     /// f = 0 along a ray between `low` (inside) and `high` (outside): Newton, kept in the bracket by bisection.

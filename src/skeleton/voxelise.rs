@@ -30,7 +30,7 @@ pub(crate) struct Domain<'a> {
 impl Domain<'_> {
     /// Whether a point lies on the data's side of the cut planes and within the field's box.
     pub(crate) fn has_data(&self, x: P3) -> bool {
-        self.field.bounds().contains(x) && self.cuts.iter().all(|c| (x - c.point).dot(c.outward) <= 0.0)
+        self.field.bounds().contains(x) && self.cuts.iter().all(|c| !c.excludes(x))
     }
     /// Whether a point is lumen.
     pub(crate) fn contains(&self, x: P3) -> bool {

@@ -172,7 +172,7 @@ impl<'a> Bounded<'a> {
     }
     /// The plane that is nearest to being left, and the distance to its margin.
     fn nearest(&self, x: P3) -> Option<(f64, Flat)> {
-        let room = self.flats.iter().map(|f| (self.margin_mm - f.height(x.raw()), *f));
+        let room = self.flats.iter().map(|f| (self.margin_mm - f.beyond(x.raw()), *f));
         room.min_by(|a, b| a.0.total_cmp(&b.0))
     }
 }

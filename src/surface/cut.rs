@@ -116,7 +116,7 @@ fn tidy(mesh: &TriMesh, field: &dyn Field, ctx: &Ctx) -> Result<TriMesh, Error> 
 fn one(mesh: &TriMesh, field: &dyn Field, flats: &[Flat], k: usize, ctx: &Ctx) -> Result<Option<TriMesh>, Error> {
     let web = Web::weave(mesh)?;
     let plane = flats[k];
-    let mut height: Vec<f64> = web.at.iter().map(|&x| plane.height(x)).collect();
+    let mut height: Vec<f64> = web.at.iter().map(|&x| plane.beyond(x)).collect();
     let all_within = height.iter().all(|&h| h < 0.0);
     for (v, height) in height.iter_mut().enumerate() {
         let shortest = web.spokes(v as u32).map(|h| web.length(h)).fold(f64::INFINITY, f64::min);
@@ -299,7 +299,7 @@ fn number(mesh: &mut TriMesh, flats: &[Flat]) -> Result<Vec<Cap>, Error> {
         let Some(plane) = flats.get((id as usize).wrapping_sub(1)) else { continue };
         let cap = caps[piece[t]].get_or_insert_with(|| Cap {
             face_id: 0,
-            plane: CutPlane { point: P3::from_raw(plane.point), outward: space::V3::from_raw(plane.normal) },
+            plane: plane.cut(),
             cut: id as usize - 1,
             centroid: P3::ORIGIN,
             area_mm2: 0.0,
@@ -348,10 +348,7 @@ mod tests {
     }
 
     fn ends(height: f64) -> Vec<CutPlane> {
-        vec![
-            CutPlane { point: P3::new(0.0, 0.0, height), outward: V3::Z },
-            CutPlane { point: P3::new(0.0, 0.0, -height), outward: -V3::Z },
-        ]
+        vec![CutPlane::new(P3::new(0.0, 0.0, height), V3::Z), CutPlane::new(P3::new(0.0, 0.0, -height), -V3::Z)]
     }
 
     #[test]
@@ -387,7 +384,7 @@ mod tests {
         let ctx = Ctx::new(2).unwrap();
         let field = fields::tree(vec![(V3::Z, 24.0, 3.0), (-V3::Z, 24.0, 3.0)], vec![1e-6]);
         let mut cuts = ends(10.0);
-        cuts.push(CutPlane { point: P3::new(1.0, 0.0, 9.0), outward: V3::new(0.6, 0.0, 0.8) });
+        cuts.push(CutPlane::new(P3::new(1.0, 0.0, 9.0), V3::new(0.6, 0.0, 0.8)));
         let (mesh, report) = cut(&wall(&field, fields::tips()[0], 0.5, &ctx), &field, &cuts, &ctx).unwrap();
         assert_eq!(report.caps.len(), 3);
         let s = RemeshSettings { sizing: Sizing::Uniform(0.5), ..RemeshSettings::default() };
@@ -438,7 +435,7 @@ mod tests {
             let plane = |dice: &mut crate::phantoms::Dice| {
                 let mut roll = |half: f64| dice.between(-half, half);
                 let n = V3::new(roll(1.0), roll(1.0), roll(1.0)).normalised().unwrap();
-                CutPlane { point: P3::ORIGIN + n * roll(9.0).abs(), outward: n }
+                CutPlane::new(P3::ORIGIN + n * roll(9.0).abs(), n)
             };
             let mut cuts = vec![plane(&mut dice), plane(&mut dice), plane(&mut dice)];
             let outcome = |cuts: &[CutPlane]| match cut(&mesh, &field, cuts, &ctx) {
@@ -466,11 +463,11 @@ mod tests {
         let ctx = Ctx::new(1).unwrap();
         let field = fields::torus(6.0, 2.0);
         let mesh = wall(&field, P3::new(8.0, 0.0, 0.0), 0.5, &ctx);
-        let flat = |z: f64, n: V3| [CutPlane { point: P3::new(0.0, 0.0, z), outward: n }];
+        let flat = |z: f64, n: V3| [CutPlane::new(P3::new(0.0, 0.0, z), n)];
         assert!(matches!(cut(&mesh, &field, &flat(0.3, V3::Z), &ctx), Err(Error::NestedRims { plane: 0, .. })));
         assert!(matches!(cut(&mesh, &field, &flat(-3.0, V3::Z), &ctx), Err(Error::NothingLeft { plane: 0, .. })));
         assert_eq!(cut(&mesh, &field, &flat(5.0, V3::Z), &ctx).unwrap().1.missed, vec![0]);
-        let across = [CutPlane { point: P3::ORIGIN, outward: V3::X }];
+        let across = [CutPlane::new(P3::ORIGIN, V3::X)];
         assert_eq!(cut(&mesh, &field, &across, &ctx).unwrap().1.caps.len(), 2);
     }
 }

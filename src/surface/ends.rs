@@ -19,7 +19,6 @@ use crate::web::Web;
 use crate::{Cap, Error, Sizing, TriMesh, WALL, self_intersections};
 use exec::Ctx;
 use glam::{DMat3, DVec3};
-use imaging::CutPlane;
 use implicit::Field;
 use space::{P3, V3};
 
@@ -269,7 +268,8 @@ impl Duct {
             }
             row = next;
         }
-        let plane = Flat { point: self.centre + self.direction * self.length, normal: self.direction };
+        let plane =
+            Flat { point: self.centre + self.direction * self.length, normal: self.direction, reach: f64::INFINITY };
         Built { plane, faces: from..out.triangles.len(), last: row, duct: self }
     }
 }
@@ -288,7 +288,7 @@ impl Built {
         let rim = |i: usize| mesh.vertices[self.last[i % n] as usize];
         let cap = Cap {
             face_id: id,
-            plane: CutPlane { point: P3::from_raw(self.plane.point), outward: V3::from_raw(self.plane.normal) },
+            plane: self.plane.cut(),
             cut: id as usize - 1,
             centroid: P3::from_raw(sum / area),
             area_mm2: area,
@@ -348,7 +348,7 @@ fn capped(open: &TriMesh, field: &dyn Field, ducts: &[Built], ctx: &Ctx) -> Resu
         return Ok(mesh);
     }
     let most = mesh.face_id.iter().copied().max().unwrap_or(WALL) as usize;
-    let mut planes = vec![Flat { point: DVec3::ZERO, normal: DVec3::Z }; most];
+    let mut planes = vec![Flat { point: DVec3::ZERO, normal: DVec3::Z, reach: f64::INFINITY }; most];
     for b in ducts {
         planes[b.duct.wanted.face_id as usize - 1] = b.plane;
     }
@@ -413,6 +413,7 @@ mod tests {
     use super::*;
     use crate::fields::{self, Analytic};
     use crate::{PolygoniseSettings, RemeshSettings, check, cut, polygonise, quality, remesh};
+    use imaging::CutPlane;
     use space::{Aabb, Faulty};
 
     fn meshed(field: &Analytic, seed: P3, cuts: &[CutPlane], sizing: Sizing, ctx: &Ctx) -> TriMesh {
@@ -424,7 +425,7 @@ mod tests {
     }
 
     fn plane(z: f64, n: V3) -> CutPlane {
-        CutPlane { point: P3::new(0.0, 0.0, z), outward: n }
+        CutPlane::new(P3::new(0.0, 0.0, z), n)
     }
 
     fn all(mesh: &TriMesh, diameters: f64) -> Vec<Extension> {
@@ -546,7 +547,7 @@ mod tests {
         let ctx = Ctx::new(2).unwrap();
         // A quarter of a torus is cut away: the two ducts cross.
         let field = fields::torus(6.0, 1.5);
-        let cuts = [CutPlane { point: P3::new(0.0, 3.0, 0.0), outward: V3::new(-0.6, 0.8, 0.0) }];
+        let cuts = [CutPlane::new(P3::new(0.0, 3.0, 0.0), V3::new(-0.6, 0.8, 0.0))];
         let mesh = meshed(&field, P3::new(0.0, -7.5, 0.0), &cuts, Sizing::Uniform(0.4), &ctx);
         let wanted = all(&mesh, 6.0);
         assert_eq!(wanted.len(), 2);

@@ -9,7 +9,7 @@ use exec::Ctx;
 use glam::DVec3;
 use imaging::CutPlane;
 use implicit::Field;
-use space::P3;
+use space::{P3, V3};
 
 /// |f| / |grad f| at which a landing stops, mm. The cubic RBF's cancellation noise is about 2e-11 mm.
 pub(crate) const LANDED_MM: f64 = 2e-10;
@@ -23,11 +23,24 @@ const MOST_STEPS: usize = 48;
 pub(crate) struct Flat {
     pub(crate) point: DVec3,
     pub(crate) normal: DVec3,
+    /// See [`CutPlane::reach_mm`].
+    pub(crate) reach: f64,
 }
 
 impl Flat {
     pub(crate) fn of(cut: &CutPlane) -> Option<Self> {
-        Some(Self { point: cut.point.raw(), normal: cut.outward.normalised()?.raw() })
+        Some(Self { point: cut.point.raw(), normal: cut.outward.normalised()?.raw(), reach: cut.reach_mm })
+    }
+    pub(crate) fn cut(&self) -> CutPlane {
+        CutPlane::new(P3::from_raw(self.point), V3::from_raw(self.normal)).within(self.reach)
+    }
+    /// Signed distance, positive outward; minus infinity out of reach.
+    pub(crate) fn beyond(&self, x: DVec3) -> f64 {
+        if self.reach == f64::INFINITY || x.distance(self.point) <= self.reach {
+            self.height(x)
+        } else {
+            f64::NEG_INFINITY
+        }
     }
     /// Signed distance, positive outward.
     pub(crate) fn height(&self, x: DVec3) -> f64 {

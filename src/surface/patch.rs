@@ -304,10 +304,7 @@ mod tests {
     }
 
     fn ends() -> [CutPlane; 2] {
-        [
-            CutPlane { point: P3::new(0.0, 0.0, 15.03), outward: V3::Z },
-            CutPlane { point: P3::new(0.0, 0.0, -15.0), outward: -V3::Z },
-        ]
+        [CutPlane::new(P3::new(0.0, 0.0, 15.03), V3::Z), CutPlane::new(P3::new(0.0, 0.0, -15.0), -V3::Z)]
     }
 
     /// Every face must run the same way through (u, v): no fold, and v must span one turn.
@@ -355,7 +352,7 @@ mod tests {
         let branches = [(V3::Z, 3.0), (-V3::Z, 3.0), (V3::new(0.8, 0.0, 0.6), 2.5), (V3::new(-0.6, 0.0, 0.8), 2.5)];
         let field = fields::tree(branches.map(|(d, r)| (d, 24.0, r)).to_vec(), vec![1.5, 1.5, 1.5]);
         // The side first: its branch's tip, which the upper plane would graze, is gone by then.
-        let mut cuts = vec![CutPlane { point: P3::new(15.0, 0.0, 0.0), outward: V3::X }];
+        let mut cuts = vec![CutPlane::new(P3::new(15.0, 0.0, 0.0), V3::X)];
         cuts.extend(ends());
         let (mesh, caps) = meshed(&field, &cuts, &ctx);
         assert_eq!(caps, 4);

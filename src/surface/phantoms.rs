@@ -30,10 +30,7 @@ pub(crate) struct Phantom {
 
 /// Planes across the z axis at plus and minus a height.
 fn ends(height: f64) -> Vec<CutPlane> {
-    vec![
-        CutPlane { point: P3::new(0.0, 0.0, height), outward: V3::Z },
-        CutPlane { point: P3::new(0.0, 0.0, -height), outward: -V3::Z },
-    ]
+    vec![CutPlane::new(P3::new(0.0, 0.0, height), V3::Z), CutPlane::new(P3::new(0.0, 0.0, -height), -V3::Z)]
 }
 
 /// The phantom of a number: its kind is `kind % 4`, its measures are rolled.

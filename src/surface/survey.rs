@@ -82,7 +82,7 @@ fn surfaces_without_a_seed_too_large_or_out_of_the_data_are_refused() {
     assert_eq!(run(&field, P3::new(2.0, 0.0, 0.0), 100), "surface.too_many_cells");
     let open = Analytic { f: Box::new(|x: P3| (x.z(), V3::Z)), bounds: field.bounds };
     assert_eq!(run(&open, P3::new(0.0, 0.0, 0.1), 100_000), "surface.leaves_data");
-    let cuts = [V3::X, -V3::X, V3::Y, -V3::Y, V3::Z].map(|n| CutPlane { point: P3::ORIGIN + n * 3.0, outward: n });
+    let cuts = [V3::X, -V3::X, V3::Y, -V3::Y, V3::Z].map(|n| CutPlane::new(P3::ORIGIN + n * 3.0, n));
     let bounded = Bounded::new(&open, &cuts, 1.0);
     let (mesh, _) = polygonise(&bounded, &[P3::new(0.0, 0.0, 0.1)], &PolygoniseSettings::default(), &ctx).unwrap();
     assert_eq!(topology(&mesh).unwrap().euler, 2);

@@ -101,6 +101,12 @@ enum Rule {
     Word(&'static [&'static str]),
     /// A list of some words.
     Words(&'static [&'static str]),
+    /// True or false.
+    Flag,
+    /// A branch's role or number.
+    Branch,
+    /// A list of objects; the first field of each is needed.
+    Objects(&'static [(&'static str, Rule)]),
     /// An object; with `true` all its fields are needed.
     Object(&'static [(&'static str, Rule)], Presence),
 }
@@ -132,7 +138,24 @@ const PLAN: &[(&str, Rule)] = &[
         Object(&[("fit_from_diameters", Number(0.0, 100.0)), ("fit_to_diameters", Number(0.1, 100.0))], Optional),
     ),
     ("outputs", Words(&["surface", "skeleton", "volume", "graphml", "swc"])),
+    ("variant", Object(&[("changes", Objects(CHANGE))], Optional)),
 ];
+
+const CHANGE: &[(&str, Rule)] = &[
+    ("branch", Branch),
+    ("angle_deg", Number(5.0, 175.0)),
+    ("to", Branch),
+    ("curvature_factor", Number(0.0, 10.0)),
+    ("curvature_per_mm", Number(0.0, 10.0)),
+    ("torsion_per_mm", Number(-10.0, 10.0)),
+    ("straight", Flag),
+    ("planar", Flag),
+];
+
+/// Roles that a change may name.
+const ROLES: &[&str] = &["graft", "proximal", "distal", "host_a", "host_b"];
+/// Most changes of a variant.
+const MAX_CHANGES: usize = 100;
 
 const GEOMETRY: &[(&str, Rule)] = &[
     ("pixel_spacing_mm", Pair(1e-4, 100.0)),
@@ -208,6 +231,9 @@ fn drop_nulls(value: &mut Value) {
         map.retain(|_, v| !v.is_null());
         map.values_mut().for_each(drop_nulls);
     }
+    if let Value::Array(items) = value {
+        items.iter_mut().for_each(drop_nulls);
+    }
 }
 
 fn invalid(path: &str, message: impl Into<String>, faults: &mut Vec<PlanFault>) {
@@ -231,6 +257,14 @@ fn check(path: &str, value: &Value, rule: &Rule, faults: &mut Vec<PlanFault>) {
     let within = |x: f64, lo: f64, hi: f64| (lo..=hi).contains(&x);
     let problem = match *rule {
         Object(fields, presence) => return check_object(path, value, fields, presence, faults),
+        Objects(fields) => return check_objects(path, value, fields, faults),
+        Flag => (!value.is_boolean()).then(|| format!("true or false is wanted, not {}", shown(value))),
+        Branch => {
+            let right =
+                value.as_str().is_some_and(|w| ROLES.contains(&w)) || value.as_u64().is_some_and(|i| i <= 1 << 20);
+            (!right)
+                .then(|| format!("a branch's number or one of {} is wanted, not {}", ROLES.join(", "), shown(value)))
+        }
         Number(lo, hi) => (!value.as_f64().is_some_and(|x| within(x, lo, hi)))
             .then(|| format!("a number from {lo} to {hi} is wanted, not {}", shown(value))),
         Pair(lo, hi) => (!numbers(value).is_some_and(|p| p.len() == 2 && p.iter().all(|x| within(*x, lo, hi))))
@@ -310,6 +344,24 @@ fn check_object(
     for (name, _) in fields.iter().filter(|_| presence == Required) {
         if map.get(*name).is_none_or(Value::is_null) {
             invalid(&below(name), "it is missing", faults);
+        }
+    }
+}
+
+fn check_objects(path: &str, value: &Value, fields: &'static [(&'static str, Rule)], faults: &mut Vec<PlanFault>) {
+    let Some(items) = value.as_array().filter(|a| a.len() <= MAX_CHANGES) else {
+        return invalid(
+            path,
+            format!("a list of at most {MAX_CHANGES} objects is wanted, not {}", shown(value)),
+            faults,
+        );
+    };
+    for (i, item) in items.iter().enumerate() {
+        let at = format!("{path}[{i}]");
+        check_object(&at, item, fields, Optional, faults);
+        let (needed, _) = fields[0];
+        if item.is_object() && item.get(needed).is_none_or(Value::is_null) {
+            invalid(&format!("{at}.{needed}"), "it is missing", faults);
         }
     }
 }

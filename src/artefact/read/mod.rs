@@ -24,6 +24,7 @@ mod nrrd;
 mod pictures;
 mod report;
 mod samples;
+mod sections;
 mod volume;
 
 pub use crate::NamedBytes;
@@ -32,6 +33,7 @@ pub use error::Error;
 pub use intake::intake;
 pub use limits::Limits;
 pub use report::{Acquisition, Format, InputReport, stack, stack_of};
+pub use sections::{SECTIONS_SCHEMA, sections};
 
 #[cfg(test)]
 mod tests;

@@ -8,7 +8,8 @@ use crate::reconstruction::{
 };
 use imaging::{Axis, Contours};
 use morphometry::{
-    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Section, Stenosis, VmtkAngles,
+    Angle, Branch, ByDistance, CurveKind, Helix, Junction, Morphometry, Role, Section, SectionOutline, Stenosis,
+    VmtkAngles,
 };
 use skeleton::{Edge, MedialGraph, Node, NodeKind};
 use space::{P3, Place, V3, Warning};
@@ -115,6 +116,11 @@ fn branch(id: usize) -> (Edge, Branch) {
         shape: (i >= 4).then_some(0.98),
         area_error_mm2: (i >= 4).then_some(0.2),
         curvature_error_per_mm: Some(0.002),
+        outline: (i >= 4).then(|| SectionOutline {
+            centre: at(i),
+            first: end.normalised().unwrap().any_orthonormal(),
+            radii_mm: vec![r(i) + 0.06; 16],
+        }),
         in_junction: i < 10,
         open: i + 1 == n,
     };
@@ -314,6 +320,7 @@ impl Fixture {
             morphometry: &self.morphometry,
             warnings: &self.warnings,
             pictures: (0..3).map(slice_picture).collect(),
+            variant: None,
         }
     }
 }

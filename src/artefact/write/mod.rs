@@ -18,6 +18,7 @@ pub mod png;
 mod provenance;
 pub mod render;
 mod result;
+mod sections;
 mod slices;
 mod stl;
 mod style;
@@ -38,6 +39,7 @@ pub use html::report_html;
 pub use json::DIGITS;
 pub use provenance::{Provenance, StageTime, provenance};
 pub use result::{result_json, skeleton_json};
+pub use sections::sections_json;
 pub use slices::slice_pictures;
 pub use stl::surface_stl;
 pub use trees::{skeleton_graphml, skeleton_swc};
@@ -57,6 +59,8 @@ pub const SKELETON_VTP: &str = "skeleton.vtp";
 pub const SKELETON_GRAPHML: &str = "skeleton.graphml";
 /// The medial lines as a tree, when asked for.
 pub const SKELETON_SWC: &str = "skeleton.swc";
+/// The cross-sections with their outlines, from which variants are made.
+pub const SECTIONS_JSON: &str = "sections.json";
 /// The surface for VTK.
 pub const SURFACE_VTP: &str = "surface.vtp";
 /// The surface and the medial lines for viewers.
@@ -113,7 +117,7 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
 }
 
 /// Every artefact but provenance.json, in this order: result.json, angles.csv, skeleton.json, skeleton.vtp, surface.vtp,
-/// surface.glb, surface.stl, contours.vtp, report.html, preview.png.
+/// surface.glb, surface.stl, contours.vtp, sections.json, report.html, preview.png.
 ///
 /// # Errors
 /// [`Error::NotFinite`] for a number that is not finite, with its path; [`Error::Mismatch`] for arrays that do not fit
@@ -130,6 +134,7 @@ pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
         make(SURFACE_GLB, surface_glb(r))?,
         make(SURFACE_STL, surface_stl(r.surface.mesh))?,
         make(CONTOURS_VTP, geometry::contours_vtp(&contours))?,
+        make(SECTIONS_JSON, sections_json(r))?,
         make(REPORT_HTML, report_html(r))?,
         make(PREVIEW_PNG, render::thumbnail(r, PREVIEW_SIZE))?,
     ])

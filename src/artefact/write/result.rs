@@ -2,12 +2,14 @@
 //!
 //! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
 //! `displacement_mm`, `patches` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
-//! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`.
+//! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`;
+//! `variant` where the result is a re-synthesis.
 //! What could not be had is null.
 
 use super::json::{Json, warning};
 use super::{Error, RESULT_JSON, SKELETON_JSON};
 use crate::Reconstruction;
+use crate::plan::{self, VariantChange};
 use crate::reconstruction::{CapFacts, Range};
 use morphometry::{Angle, Branch, Helix, Junction, Section, Stenosis, VmtkAngles};
 use skeleton::{MedialGraph, NodeKind};
@@ -18,7 +20,7 @@ use skeleton::{MedialGraph, NodeKind};
 /// [`Error::NotFinite`] with the JSON path.
 pub fn result_json(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
     let m = r.morphometry;
-    Json::Object(vec![
+    let mut members = vec![
         ("schema", "vasculum/result/1".into()),
         ("frame", "LPS".into()),
         ("units", Json::Object(vec![("length", "mm".into()), ("angle", "deg".into())])),
@@ -30,11 +32,14 @@ pub fn result_json(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
         ("branches", Json::List(m.branches.iter().map(branch).collect())),
         ("junctions", Json::List(m.junctions.iter().map(junction).collect())),
         ("warnings", Json::List(r.all_warnings().into_iter().map(warning).collect())),
-    ])
-    .print(RESULT_JSON)
+    ];
+    if let Some(v) = &r.variant {
+        members.push(("variant", Json::Object(vec![("changes", Json::List(v.changes.iter().map(change).collect()))])));
+    }
+    Json::Object(members).print(RESULT_JSON)
 }
 
-fn input(r: &Reconstruction<'_>) -> Json {
+pub(super) fn input(r: &Reconstruction<'_>) -> Json {
     let i = &r.input;
     Json::Object(vec![
         ("slices", i.slices.into()),
@@ -134,6 +139,25 @@ fn graph(r: &Reconstruction<'_>) -> Json {
         ("edges", Json::List(g.edges.iter().enumerate().map(|(i, e)| Json::Object(edge(r, i, e))).collect())),
         ("cycles", g.cycles().into()),
     ])
+}
+
+/// A change as the plan asked for it.
+fn change(c: &VariantChange) -> Json {
+    let which = |b: &plan::Branch| match b {
+        plan::Branch::Id(id) => Json::from(*id),
+        plan::Branch::Role(name) => name.into(),
+    };
+    let members: [(&'static str, Json); 8] = [
+        ("branch", which(&c.branch)),
+        ("angle_deg", c.angle_deg.into()),
+        ("to", c.to.as_ref().map_or(Json::Null, which)),
+        ("curvature_factor", c.curvature_factor.into()),
+        ("curvature_per_mm", c.curvature_per_mm.into()),
+        ("torsion_per_mm", c.torsion_per_mm.into()),
+        ("straight", c.straight.into()),
+        ("planar", c.planar.into()),
+    ];
+    Json::Object(members.into_iter().filter(|(_, v)| *v != Json::Null).collect())
 }
 
 fn branch(b: &Branch) -> Json {

@@ -157,6 +157,44 @@ fn arrays_that_do_not_fit_together_are_refused() {
 }
 
 #[test]
+fn sections_are_read_back_as_they_were_written() {
+    let f = Fixture::new();
+    let r = f.reconstruction();
+    let (read, input) = crate::read::sections("sections.json", &sections_json(&r).unwrap()).unwrap();
+    let tips: Vec<usize> = (0..r.graph.nodes.len()).filter(|&n| r.graph.nodes[n].cap.is_none()).collect();
+    let wanted = morphometry::Model::of(r.morphometry, &tips, r.contours.pixel_mm);
+    assert_eq!(input, r.input);
+    assert_eq!((read.branches.len(), read.junctions.len()), (wanted.branches.len(), wanted.junctions.len()));
+    for (a, b) in read.branches.iter().zip(&wanted.branches) {
+        assert_eq!((a.id, a.role, a.nodes), (b.id, b.role, b.nodes));
+        for (a, b) in a.sections.iter().zip(&b.sections) {
+            assert!(a.position.distance(b.position) < 1e-6 && a.tangent.angle_to(b.tangent) < 1e-7);
+            assert_eq!(a.outline.is_some(), b.outline.is_some());
+            let radii = |s: &morphometry::ModelSection| s.outline.as_ref().map_or(Vec::new(), |o| o.radii_mm.clone());
+            assert!(radii(a).iter().zip(radii(b)).all(|(x, y)| (x - y).abs() < 1e-7));
+        }
+    }
+}
+
+#[test]
+fn a_damaged_sections_file_is_refused_with_what_is_wrong() {
+    let f = Fixture::new();
+    let text = String::from_utf8(sections_json(&f.reconstruction()).unwrap()).unwrap();
+    for (from, to, what) in [
+        ("vasculum/sections/1", "vasculum/sections/9", "schema"),
+        ("\"pixel_mm\": ", "\"pixel_mm\": -", "pixel_mm"),
+        ("\"role\": \"graft\"", "\"role\": \"wife\"", "role"),
+        ("\"tangent\": [", "\"tangent\": [9.0, ", "sections.json"),
+        ("\"radii_mm\": [", "\"radii_mm\": [-1.0, ", "radius"),
+    ] {
+        let damaged = text.replacen(from, to, 1);
+        assert_ne!(damaged, text, "{from}");
+        let error = crate::read::sections("sections.json", damaged.as_bytes()).unwrap_err().to_string();
+        assert!(error.contains(what), "{what}: {error}");
+    }
+}
+
+#[test]
 fn all_artefacts_come_in_a_fixed_order_and_with_the_same_bytes() {
     let f = Fixture::new();
     let all = write_all(&f.reconstruction()).unwrap();
@@ -172,6 +210,7 @@ fn all_artefacts_come_in_a_fixed_order_and_with_the_same_bytes() {
             "surface.glb",
             "surface.stl",
             "contours.vtp",
+            "sections.json",
             "report.html",
             "preview.png"
         ]

@@ -67,7 +67,7 @@ fn scan(seed: u64, coarse: bool, table: &mut Table) -> Result<(), String> {
     let sampled = Sampled::new(&f, &raw.vertices, &smoothing.sampling(), &ctx).map_err(|e| words(&e))?;
     let caps: Vec<CapHint> =
         branches.iter().enumerate().filter_map(|(i, b)| cap(i as u32 + 1, b, &contours.cuts)).collect();
-    let inside = |p: &space::P3| contours.cuts.iter().all(|c| (*p - c.point).dot(c.outward) <= 0.0);
+    let inside = |p: &space::P3| contours.cuts.iter().all(|c| !c.excludes(*p));
     let seeds: Vec<space::P3> = f.inner().iter().copied().filter(inside).collect();
     let (graph, _) = medial_graph(&sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), &ctx)
         .map_err(|e| words(&e))?;

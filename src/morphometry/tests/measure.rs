@@ -73,7 +73,7 @@ fn star(centre: DVec3, branches: &[(DVec3, f64, f64)], wobble: f64) -> Case {
             .collect();
         add(&mut case.graph, 0, &points, radius);
         case.graph.nodes[i + 1].cap = Some(i as u32 + 1);
-        case.cuts.push(CutPlane { point: P3::from_raw(centre + d * length), outward: V3::from_raw(d) });
+        case.cuts.push(CutPlane::new(P3::from_raw(centre + d * length), V3::from_raw(d)));
     }
     case
 }
@@ -279,7 +279,7 @@ fn a_short_branch_gives_null_and_says_why() {
         [(DVec3::new(1.0, 0.0, 1.0), 10.0, 2.5), (DVec3::Z, 36.0, 3.0), (DVec3::new(0.0, 0.2, -1.0), 36.0, 3.0)];
     let mut case = star(DVec3::ZERO, &branches, 0.0);
     // a plane across the graft that leaves the host whole
-    case.cuts[0] = CutPlane { point: P3::new(8.0, 0.0, 0.0), outward: V3::X };
+    case.cuts[0] = CutPlane::new(P3::new(8.0, 0.0, 0.0), V3::X);
     let roles = Roles { graft: Some(case.graph.edges[0].points[30]), ..Roles::default() };
     let m = run(&case, roles).unwrap();
     assert_eq!(angle(&m.junctions[0], "graft_host_a"), None);
@@ -313,7 +313,7 @@ fn a_bent_distal_vessel_is_told_by_the_curve_over_distance() {
     case.graph.nodes[3].position = line[120];
     case.graph.edges[2] = Edge { nodes: [0, 3], radius_mm: vec![3.0; line.len()], points: line };
     let d = bent(36.1) - bent(36.0);
-    case.cuts[2] = CutPlane { point: P3::from_raw(bent(36.0)), outward: V3::from_raw(d.normalize()) };
+    case.cuts[2] = CutPlane::new(P3::from_raw(bent(36.0)), V3::from_raw(d.normalize()));
     let m = run(&case, points(&case, [true; 3])).unwrap();
     let a = m.junctions[0].angles.iter().find(|a| a.name == "graft_distal").unwrap();
     let curve = a.by_distance.as_ref().unwrap();
@@ -400,7 +400,7 @@ fn a_loop_between_two_junctions_is_measured_at_both() {
         let line: Vec<DVec3> = (0..=80).map(|k| start + out * (0.4 * f64::from(k))).collect();
         case.field.0.push((vec![start, start + out * 40.0], 2.0));
         add(&mut case.graph, from, &line, 2.0);
-        case.cuts.push(CutPlane { point: P3::from_raw(start + out * 32.0), outward: V3::from_raw(out) });
+        case.cuts.push(CutPlane::new(P3::from_raw(start + out * 32.0), V3::from_raw(out)));
     }
     assert_eq!(case.graph.cycles(), 1);
     let m = run(&case, Roles::default()).unwrap();
@@ -416,7 +416,7 @@ fn a_loop_between_two_junctions_is_measured_at_both() {
 fn sections_beyond_a_cut_are_open_and_cancelled_work_stops() {
     let mut case = anastomosis(45.0, 15.0, [2.5, 3.0, 3.0], 0.0);
     let d = V3::new(1.0, 0.0, 1.0).normalised().unwrap();
-    case.cuts[0] = CutPlane { point: case.graph.nodes[0].position + d * 30.0, outward: V3::X };
+    case.cuts[0] = CutPlane::new(case.graph.nodes[0].position + d * 30.0, V3::X);
     let m = run(&case, points(&case, [true; 3])).unwrap();
     let last = m.branches[0].sections.last().unwrap();
     assert!(last.open && last.area_mm2.is_none());
@@ -505,7 +505,7 @@ fn every_junction_of_a_tree_is_measured() {
         let start = if from == 0 { low } else { high };
         case.field.0.push((vec![start, start + d * 36.0], 2.0));
         add(&mut case.graph, from, &line(start, d, 30.0), 2.0);
-        case.cuts.push(CutPlane { point: P3::from_raw(start + d * 30.0), outward: V3::from_raw(d) });
+        case.cuts.push(CutPlane::new(P3::from_raw(start + d * 30.0), V3::from_raw(d)));
     }
     // planes of side branches would cut the others: keep only those across the host
     case.cuts = vec![case.cuts[0], case.cuts[2]];
@@ -581,7 +581,7 @@ fn branches_that_bend_apart_part_where_their_lumens_do() {
     for (points, radius) in [(trunk, 4.0), (arm(1.0), 3.0), (arm(-1.0), 3.0)] {
         let (last, before) = (points[points.len() - 1], points[points.len() - 2]);
         let outward = (last - before).normalize();
-        case.cuts.push(CutPlane { point: P3::from_raw(last), outward: V3::from_raw(outward) });
+        case.cuts.push(CutPlane::new(P3::from_raw(last), V3::from_raw(outward)));
         add(&mut case.graph, 0, &points, radius);
         let longer = points.iter().copied().chain([last + outward * 6.0]).collect();
         case.field.0.push((longer, radius));

@@ -97,7 +97,7 @@ impl Field for Torus {
 /// A cut plane and a cap at `centroid`, `outward` need not be of unit length.
 pub(crate) fn opening(face_id: u32, centroid: P3, outward: V3) -> (CutPlane, CapHint) {
     let normal = outward.normalised().unwrap();
-    (CutPlane { point: centroid, outward: normal }, CapHint { face_id, centroid, normal })
+    (CutPlane::new(centroid, normal), CapHint { face_id, centroid, normal })
 }
 
 /// Straight branches from `centre`: (direction, length, radius). Each is cut at a right angle at its length (the tube
