@@ -3,13 +3,15 @@
 //! After the tissue background is taken off, a geometric series of global levels is tried; at each the largest
 //! components are measured and scored:
 //!
-//! score = length x roundness^2 x branching x edge x position
+//! score = length x roundness^2 x branching x edge x brightness x position
 //!
 //! length: geodesic length of the skeleton-like tree in mm (longest geodesic from one extremity plus the persistence of
 //! every further maximum of the geodesic distance); roundness: 2 V / A over the radius of the tube of equal volume and
 //! length, 1 for tubes, small for sheets and organs; branching: 2 with at least two ends besides the root, else 1; edge:
 //! mean step across the boundary over the mean height inside, largest at half height, so that a level at which
-//! neighbours melt together loses; position: 1 in the middle of the volume, .75 in its corners.
+//! neighbours melt together loses; brightness: mean height inside over that of the brightest voxels of the volume, without
+//! which the ridges of tissue texture, tangled and long, win against a tube as soon as the noise no longer hides them
+//! (SNR 100: 36 against 22); position: 1 in the middle of the volume, .75 in its corners.
 
 use crate::region::{Around, NEIGHBOURS, components};
 use crate::volume::{Volume, quantile};
@@ -83,6 +85,7 @@ pub(crate) fn candidates(
 ) -> Result<Vec<Candidate>, Error> {
     let levels = if settings.threshold.is_some() { vec![0.0] } else { levels(v, noise) };
     let least = std::f64::consts::PI * LEAST_RADIUS_MM.powi(2) * LEAST_LENGTH_MM;
+    let top = top(v);
     let least = (least / (v.step[0] * v.step[1] * v.step[2])).max(8.0) as usize;
     let found = ctx.map_range(levels.len(), |k| {
         let level = levels[k] as f32;
@@ -96,7 +99,7 @@ pub(crate) fn candidates(
         parts.truncate(PER_LEVEL);
         let strict = matches!(wanted, Wanted::Best);
         let mut slots = vec![u32::MAX; v.data.len()];
-        parts.into_iter().filter_map(|p| measured(v, levels[k], p, strict, &mut slots)).collect::<Vec<_>>()
+        parts.into_iter().filter_map(|p| measured(v, (levels[k], top), p, strict, &mut slots)).collect::<Vec<_>>()
     })?;
     let mut all: Vec<Candidate> = found.into_iter().flatten().collect();
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
@@ -111,9 +114,7 @@ pub(crate) fn candidates(
 
 /// The levels tried, ascending.
 pub(crate) fn levels(v: &Volume, noise: f64) -> Vec<f64> {
-    let stride = v.data.len() / 400_000 + 1;
-    let mut sample: Vec<f64> = v.data.iter().step_by(stride).map(|&x| f64::from(x)).collect();
-    let top = quantile(&mut sample, 1.0 - TOP_SHARE);
+    let top = top(v);
     let low = (LEAST_NOISE * noise).max(0.08 * top);
     if top.is_nan() || top <= low {
         return Vec::new();
@@ -121,8 +122,21 @@ pub(crate) fn levels(v: &Volume, noise: f64) -> Vec<f64> {
     (0..LEVELS).map(|k| low * (top / low).powf(k as f64 / LEVELS as f64)).collect()
 }
 
+/// Height of the brightest voxels: the share that the highest level leaves.
+fn top(v: &Volume) -> f64 {
+    let stride = v.data.len() / 400_000 + 1;
+    let mut sample: Vec<f64> = v.data.iter().step_by(stride).map(|&x| f64::from(x)).collect();
+    quantile(&mut sample, 1.0 - TOP_SHARE)
+}
+
 /// Measures and scores a component (`slots` is all `u32::MAX` before and after); `None` when it is no tube of the least size.
-fn measured(v: &Volume, level: f64, voxels: Vec<u32>, strict: bool, slots: &mut [u32]) -> Option<Candidate> {
+fn measured(
+    v: &Volume,
+    (level, top): (f64, f64),
+    voxels: Vec<u32>,
+    strict: bool,
+    slots: &mut [u32],
+) -> Option<Candidate> {
     for (k, &i) in voxels.iter().enumerate() {
         slots[i as usize] = k as u32;
     }
@@ -143,7 +157,8 @@ fn measured(v: &Volume, level: f64, voxels: Vec<u32>, strict: bool, slots: &mut 
         return None;
     }
     let branching = if ends >= 2 { 2.0 } else { 1.0 };
-    let score = length_mm * roundness * roundness * branching * (step / height) * position(v, &voxels);
+    let brightness = (height / top).clamp(0.0, 1.0).powi(2);
+    let score = length_mm * roundness * roundness * branching * (step / height) * brightness * position(v, &voxels);
     Some(Candidate { level, voxels, score, length_mm, radius_mm, ends })
 }
 

@@ -10,7 +10,7 @@ use space::{Aabb, P3, Patient, Place, Warning};
 /// A vessel that was considered.
 #[derive(Clone, Copy, Debug)]
 pub struct Vessel {
-    /// Score of the choice (length in mm x roundness^2 x branching x edge x position); compares within one stack only.
+    /// Score of the choice (length in mm x roundness^2 x branching x edge x brightness x position); compares within one stack only.
     pub score: f64,
     /// Box around it, LPS mm.
     pub bounds: Aabb<Patient>,

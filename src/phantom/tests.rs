@@ -327,3 +327,21 @@ fn a_cancelled_scan_says_so() {
     ctx.cancel();
     assert_eq!(scan(Kind::Tube, &small(Kind::Tube), &ctx).map(|_| ()), Err(Error::Cancelled));
 }
+
+#[test]
+fn without_noise_the_vessel_is_found_and_not_the_texture_of_the_tissue() {
+    // texture is hidden by noise at SNR 20 and tangled, long and smooth without it
+    let ctx = Ctx::new(2).unwrap();
+    for (snr, distractors) in [(None, 0), (Some(100.0), 2)] {
+        let scan = Settings { snr, distractors, ..Settings::of(Kind::Tube) };
+        let scene = Scene::new(Kind::Tube, &scan).unwrap();
+        let stack = scene.image(&ctx).unwrap();
+        let (contours, _) = imaging::contours(&stack, &imaging::Settings::default(), &ctx).unwrap();
+        assert_eq!(contours.curves.len(), scan.slices, "SNR {snr:?}, {distractors} distractors");
+        for curve in &contours.curves {
+            let plane = &contours.planes[curve.plane];
+            let p = curve.at(plane, 0.0).position;
+            assert!(scene.vessel.distance(p).abs() < 0.5, "{p:?} is not on the tube's wall");
+        }
+    }
+}
