@@ -16,11 +16,11 @@ const COARSE: usize = 4;
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SampledSettings {
-    /// Lattice spacing, mm.
+    /// Lattice spacing, mm; up to twice as much where the lattice would have too many points.
     pub spacing_mm: f64,
     /// Half-width of the band of exact samples, mm.
     pub band_mm: f64,
-    /// Most lattice points; beyond: [`Error::TooManySamples`]. 40 million take 320 MB.
+    /// Most lattice points; if twice the spacing has more: [`Error::TooManySamples`]. 40 million take 320 MB.
     pub max_points: usize,
 }
 
@@ -50,14 +50,15 @@ impl Sampled {
     /// # Errors
     /// [`Error::TooFewPoints`] without wall points, [`Error::TooManySamples`], [`Error::Cancelled`].
     pub fn new(field: &dyn Field, wall: &[P3], settings: &SampledSettings, ctx: &Ctx) -> Result<Self, Error> {
-        let grid = lattice(wall, settings)?;
-        let mut values = coarse_values(field, &grid, ctx)?;
-        let near = near_points(&grid, wall, settings);
-        let points: Vec<P3> = near.iter().map(|&i| position(&grid, i)).collect();
+        let (grid, settings) = &fitting(wall, settings)?;
+        let mut values = coarse_values(field, grid, ctx)?;
+        let near = near_points(grid, wall, settings);
+        let points: Vec<P3> = near.iter().map(|&i| position(grid, i)).collect();
         for (&i, v) in near.iter().zip(field.values_of_many(&points, ctx)?) {
             values[i] = v;
         }
         to_coefficients(&mut values, grid.size, ctx)?;
+        let grid = *grid;
         let (origin, spacing) = (grid.point(0, 0, 0), settings.spacing_mm);
         let band = Arc::new(Spans::around(&near, grid.size));
         Ok(Self { grid, origin, spacing, coefficients: Arc::new(values), band, smoothed: None })
@@ -176,6 +177,22 @@ fn bend(t: f64) -> [f64; 4] {
     [1.0 - t, 3.0 * t - 2.0, 1.0 - 3.0 * t, t]
 }
 
+/// Growth of the spacing before a lattice is refused: at twice half a pixel it still has a point for every pixel.
+const COARSEST: f64 = 2.0;
+
+/// The lattice, with the spacing that keeps it within its limit.
+fn fitting(wall: &[P3], settings: &SampledSettings) -> Result<(Grid, SampledSettings), Error> {
+    let mut fitting = *settings;
+    loop {
+        match lattice(wall, &fitting) {
+            Err(Error::TooManySamples { .. }) if fitting.spacing_mm < COARSEST * settings.spacing_mm => {
+                fitting.spacing_mm = (1.1 * fitting.spacing_mm).min(COARSEST * settings.spacing_mm);
+            }
+            lattice => return lattice.map(|grid| (grid, fitting)),
+        }
+    }
+}
+
 /// A lattice around the wall points with the band's margin, its size a multiple of the coarse step plus one.
 fn lattice(wall: &[P3], settings: &SampledSettings) -> Result<Grid, Error> {
     let bounds = Aabb::around(wall.iter().copied()).ok_or(Error::TooFewPoints { points: 0, least: 1 })?;
@@ -273,6 +290,22 @@ mod tests {
         let (coarse, fine) = (error(0.5), error(0.25));
         assert!(fine < 5e-5, "{fine}");
         assert!(coarse / fine > 8.0, "{coarse} {fine}");
+    }
+
+    #[test]
+    fn a_lattice_over_its_limit_gets_coarser_up_to_twice_and_is_refused_beyond() {
+        let cylinder = Cylinder { radius: 3.0 };
+        let wall = cylinder.wall(8.0);
+        let points = sampled(0.25).1.grid().len();
+        let within = |max_points| {
+            let settings = SampledSettings { max_points, ..SampledSettings::default() };
+            Sampled::new(&cylinder, &wall, &settings, &Ctx::new(1).unwrap())
+        };
+        let coarser = within(points / 2).unwrap();
+        assert!(coarser.grid().len() <= points / 2 && coarser.spacing > 0.25 && coarser.spacing < 0.4);
+        let on_the_wall = P3::new(3.0, 0.0, 1.0);
+        assert!(coarser.value(on_the_wall).abs() < 5e-4);
+        assert!(matches!(within(points / 20), Err(Error::TooManySamples { .. })));
     }
 
     #[test]
