@@ -92,11 +92,12 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
         None => psf(&Sheets { stack, s: &s, axis, drawn: &drawn, planes: &planes }, &outlines, &smooth, ctx)?,
     };
     if sigma_mm.is_none() {
-        let message = "the point spread could not be estimated: contours are not corrected for it, and convex lumens \
-                       come out too small by kappa/2 (sigma^2 + px^2/12)";
+        let message = "the point spread could not be estimated: contours are corrected for pixel and slice thickness \
+                       alone, and convex lumens come out too small by kappa/2 sigma^2";
         warnings.push(Warning::new("contours.psf_unknown", message, Place::none()));
     }
-    let acquired = sigma_mm.map(|sigma| Blur::of(stack, sigma));
+    // the pixel and the slice blur whatever the point spread
+    let acquired = Some(Blur::of(stack, sigma_mm.unwrap_or(0.0)));
     if acquired.is_some() && stack.thickness_mm.is_none() {
         let spacing = stack.slice_spacing_mm();
         let message = format!(
@@ -232,9 +233,34 @@ struct Sheets<'a> {
 /// The point spread from edge profiles, mm: pixels within 3 px of a curve by signed distance, heights by the local
 /// levels, least squares of the normal distribution per curve and direction (normal nearer to u or to v). `None` when
 /// fewer than 8 profiles are usable. Across slices nothing is estimated.
+///
+/// A wall that leans by an angle a against the slice's normal is blurred by thickness tan a as well. The lean is known from
+/// the contours of the neighbouring slices: only nearly upright walls count, and what the thickness still adds is taken
+/// off. (A tube at 45 degrees in slices of 3 mm read .60 px as .87.)
 fn psf(sheets: &Sheets, outlines: &[(usize, usize)], smooth: &[Smoothed], ctx: &Ctx) -> Result<Option<f64>, Error> {
+    for upright_px in UPRIGHT_PX {
+        let found = psf_of_walls(sheets, outlines, smooth, upright_px, ctx)?;
+        if found.is_some() {
+            return Ok(found);
+        }
+    }
+    Ok(None)
+}
+
+/// Walls count as upright whose lean adds at most this standard deviation to the blur, px; the second is taken where the
+/// first leaves too few.
+const UPRIGHT_PX: [f64; 2] = [0.5, 1.5];
+
+fn psf_of_walls(
+    sheets: &Sheets,
+    outlines: &[(usize, usize)],
+    smooth: &[Smoothed],
+    upright_px: f64,
+    ctx: &Ctx,
+) -> Result<Option<f64>, Error> {
     let &Sheets { stack, s, axis, drawn, planes } = sheets;
     let px = stack.pixel_mm();
+    let through = stack.thickness_mm.unwrap_or(stack.slice_spacing_mm()).powi(2) / 12.0;
     let found = ctx.map_range(outlines.len(), |i| {
         let (k, o) = outlines[i];
         let outline = &drawn[k].outlines[o];
@@ -242,13 +268,22 @@ fn psf(sheets: &Sheets, outlines: &[(usize, usize)], smooth: &[Smoothed], ctx: &
         if !straight || smooth[i].spline.length() < LEAST_LENGTH_PX * px {
             return Vec::new();
         }
-        let profiles = profiles(stack, s, Frame::new(axis), k, &planes[outline.plane], &smooth[i].spline);
+        let lean = if axis == Axis::Slice { lean(drawn, planes, k, o) } else { [0.0; 2] };
+        // variance that the slice's thickness adds to a wall with this normal, mm2
+        let leaning = |inward: [f64; 2]| through * (inward[0] * lean[0] + inward[1] * lean[1]).powi(2);
+        let wall = Wall { k, plane: &planes[outline.plane], spline: &smooth[i].spline };
+        let profiles = profiles(stack, s, Frame::new(axis), &wall, &leaning, (upright_px * px).powi(2));
         let in_plane = |d: &usize| match axis {
             Axis::Slice => true,
             Axis::Row => *d == 1,
             Axis::Column => *d == 0,
         };
-        (0..2).filter(in_plane).filter_map(|d| blur(&profiles[d], 0.1 * px, 3.0 * px)).collect()
+        let width = |d: usize| {
+            let (profile, added) = &profiles[d];
+            let width = blur(profile, 0.1 * px, 3.0 * px)?;
+            Some((width.powi(2) - added).max(0.0).sqrt())
+        };
+        (0..2).filter(in_plane).filter_map(width).collect()
     })?;
     let mut widths: Vec<f64> = found.into_iter().flatten().collect();
     if widths.len() < LEAST_PROFILES {
@@ -261,20 +296,59 @@ fn psf(sheets: &Sheets, outlines: &[(usize, usize)], smooth: &[Smoothed], ctx: &
     Ok(Some((upright.powi(2) - own - px * px / 12.0).max(0.0).sqrt()))
 }
 
-/// Profiles of one curve, for normals nearer to u and nearer to v.
+/// How far a lumen moves within the plane per mm along the normal, from its own contour and the nearest ones of the
+/// neighbouring planes; 0 where there are none.
+fn lean(drawn: &[Drawn], planes: &[Plane], k: usize, o: usize) -> [f64; 2] {
+    let middle = |outline: &Outline| {
+        let n = outline.line.points.len() as f64;
+        let sum = outline.line.points.iter().fold([0.0; 2], |s, p| [s[0] + p[0], s[1] + p[1]]);
+        [sum[0] / n, sum[1] / n]
+    };
+    let own = &drawn[k].outlines[o];
+    let plane = &planes[own.plane];
+    let here = middle(own);
+    // by the patient: planes need not lie straight above each other
+    let seen = |k: usize| {
+        let others = drawn.get(k)?.outlines.iter().filter(|o| !o.hole);
+        let places = others.map(|o| {
+            let p = planes[o.plane].to_patient(middle(o));
+            let [u, v] = plane.in_plane(p);
+            [u, v, (p - plane.origin).dot(plane.normal())]
+        });
+        places.min_by(|a, b| {
+            let off = |p: &[f64; 3]| (p[0] - here[0]).hypot(p[1] - here[1]);
+            off(a).total_cmp(&off(b))
+        })
+    };
+    let below = k.checked_sub(1).and_then(seen).unwrap_or([here[0], here[1], 0.0]);
+    let above = seen(k + 1).unwrap_or([here[0], here[1], 0.0]);
+    let rise = above[2] - below[2];
+    if rise <= 0.0 { [0.0; 2] } else { [0, 1].map(|a| (above[a] - below[a]) / rise) }
+}
+
+/// A curve whose edge is looked at.
+struct Wall<'a> {
+    /// Its number among those drawn.
+    k: usize,
+    plane: &'a Plane,
+    spline: &'a PeriodicSpline,
+}
+
+/// Profiles of one curve, for normals nearer to u and nearer to v, with the mean variance that their walls' lean adds;
+/// walls that lean by more than `upright` (mm2) are left out.
 fn profiles(
     stack: &Stack,
     s: &Segmentation,
     frame: Frame,
-    k: usize,
-    plane: &Plane,
-    spline: &PeriodicSpline,
-) -> [Profile; 2] {
+    &Wall { k, plane, spline }: &Wall,
+    leaning: &impl Fn([f64; 2]) -> f64,
+    upright: f64,
+) -> [(Profile, f64); 2] {
     let px = stack.pixel_mm();
     let count = (spline.length() / (0.5 * px)).ceil() as usize;
     let samples: Vec<[[f64; 2]; 3]> =
         (0..count).map(|i| spline.derivatives(spline.length() * i as f64 / count as f64)).collect();
-    let mut out = [Vec::new(), Vec::new()];
+    let mut out = [(Vec::new(), 0.0), (Vec::new(), 0.0)];
     let [w, h, _] = frame.size(s);
     let [u0, v0, _] = frame.of.map(|a| s.low[a]);
     let reach = PROFILE_PX * px;
@@ -295,6 +369,10 @@ fn profiles(
             let [q, d, dd] = *near;
             let speed = d[0].hypot(d[1]).max(f64::MIN_POSITIVE);
             let inward = [-d[1] / speed, d[0] / speed];
+            let added = leaning(inward);
+            if added > upright {
+                continue;
+            }
             // the sample is up to a quarter of a pixel off the foot: the tangential part is taken out by curvature
             let rel = [p[0] - q[0], p[1] - q[1]];
             let along = (rel[0] * d[0] + rel[1] * d[1]) / speed;
@@ -302,8 +380,13 @@ fn profiles(
             let distance = rel[0] * inward[0] + rel[1] * inward[1] - 0.5 * kappa * along * along;
             let contrast = f64::from(s.contrast[at]).max(f64::MIN_POSITIVE);
             let height = 0.5 + f64::from(Frame::grey(s, stack, at) - s.level[at]) / contrast;
-            out[usize::from(inward[1].abs() > inward[0].abs())].push((distance, height));
+            let side = &mut out[usize::from(inward[1].abs() > inward[0].abs())];
+            side.0.push((distance, height));
+            side.1 += added;
         }
     }
-    out
+    out.map(|(profile, added)| {
+        let mean = added / profile.len().max(1) as f64;
+        (profile, mean)
+    })
 }

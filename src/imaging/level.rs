@@ -62,6 +62,11 @@ const RING: (u8, u8) = (20, 42);
 /// half height or above), ahead of a front in a fading vessel .8 to 1. Without this the aorta of a coil-faded scan
 /// takes its own dim continuation for background (level 360 where the lumen has 320) and breaks up in its last 10 rows.
 const RUNS_ON: f32 = 0.7;
+/// Weight of voxels that the slice's thickness fills with both lumen and surroundings: those of the ring above or below
+/// which the lumen lies (within 2 px), and those of the lumen above or below which it does not. They count only where
+/// nothing else is near. With full weight a tube at 45 degrees in slices of 3 mm gets a level 1.5 % of its contrast too high, one at
+/// 60 degrees 5 %, which costs 1.4 and 5 % of its area.
+const PARTIAL: f32 = 0.02;
 /// Narrowest Gaussian of the inside values, mm: at 3 mm a vessel that fades to .4 within 35 mm comes out 1.4 % too small in area, because the mean is one-sided at its end.
 const INSIDE_MM: f64 = 2.0;
 /// Narrowest Gaussian of the outside values, mm: tissue on one side of a vessel and air on the other stay apart.
@@ -118,11 +123,24 @@ impl Patch {
             // a voxel beside the boundary is half a pixel deep
             t => (f32::from(t.saturating_sub(5).min(DEEP)) / f32::from(DEEP)).powi(3),
         };
-        let ring = |i: usize| f32::from(u8::from(in_ring(i) && !runs_on(i)));
-        let inside = self.spread(depth, INSIDE_MM, ctx)?;
+        let within = distances(&masks[0], self.n, [self.tenths()[0], self.tenths()[1], f64::from(FAR)], RING.0);
+        let beside = |i: usize| self.neighbours(i).any(|j| within[j] < RING.0);
+        let ring = |i: usize| match in_ring(i) && !runs_on(i) {
+            false => 0.0,
+            true if beside(i) => PARTIAL,
+            true => 1.0,
+        };
+        let core = |i: usize| if self.neighbours(i).all(|j| masks[0][j]) { depth(i) } else { PARTIAL * depth(i) };
+        let inside = self.spread(core, INSIDE_MM, ctx)?;
         let outside = self.spread(ring, OUTSIDE_MM, ctx)?;
-        let wide = self.spread(depth, WIDE_MM, ctx)?;
+        let wide = self.spread(core, WIDE_MM, ctx)?;
         Ok(Fields { inside, outside, wide })
+    }
+    /// The voxels straight above and below one.
+    fn neighbours(&self, i: usize) -> impl Iterator<Item = usize> {
+        let area = self.n[0] * self.n[1];
+        let (below, above) = (i.checked_sub(area), Some(i + area).filter(|j| *j < self.raw.len()));
+        below.into_iter().chain(above)
     }
     /// Normalised convolution of the raw values with weights, over coarse cells of about 2/3 of the narrowest sigma.
     fn spread(&self, weight: impl Fn(usize) -> f32 + Sync, sigma_mm: f64, ctx: &Ctx) -> Result<Vec<f32>, Error> {

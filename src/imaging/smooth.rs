@@ -248,7 +248,7 @@ pub(crate) fn blur(profile: &Profile, low: f64, high: f64) -> Option<f64> {
 }
 
 /// Standard normal distribution function (Abramowitz and Stegun 7.1.26, absolute error below 1e-7).
-fn normal_cdf(x: f64) -> f64 {
+pub(crate) fn normal_cdf(x: f64) -> f64 {
     let z = x.abs() / std::f64::consts::SQRT_2;
     let t = 1.0 / (1.0 + 0.327_591_1 * z);
     let poly = [0.254_829_592, -0.284_496_736, 1.421_413_741, -1.453_152_027, 1.061_405_429];

@@ -83,17 +83,20 @@ pub fn fit_with_ensemble(
     solve(&spatial, contours, (settings, FINAL_MM, draws), &ctx.part(0.4, 1.0))
 }
 
-/// Wall points whose planar half-maximum correction is replaced by the spatial one, from the first function's normal and
-/// second derivatives (method.md 2; [`imaging::Blur`]).
+/// Wall points whose planar half-maximum correction is replaced by the one in space: where a contour was drawn, the first
+/// function has the level whose blurred image has its half-maximum there, and the wall lies where that level is
+/// ([`imaging::Blur::half_maximum_level`]).
 fn corrected(c: &Constraints, first: &Variational, contours: &Contours, ctx: &Ctx) -> Result<Vec<P3>, Error> {
     Ok(ctx.map_range(c.wall, |i| {
         let x = c.points[i];
         let (Some(blur), Some(applied)) = (contours.blur, c.planar_shift[i]) else { return x };
-        let (_, g, h) = first.hessian(x);
-        let Some(inward) = g.normalised() else { return x };
-        let wanted = blur.spatial_shift_mm(inward, &(h * g.length().recip()));
-        // along the normal, what is wanted less what the planar correction has done already
-        x - inward * (wanted + applied.dot(inward))
+        let drawn = x - applied;
+        let (value, g) = first.gradient(drawn);
+        let slope = g.length_squared();
+        let level = blur.half_maximum_level(drawn, |y| first.hessian(y));
+        let moved = level.map(|level| drawn + g * ((level - value) / slope));
+        // an expansion that leads farther than the blur itself reaches has met another wall
+        moved.filter(|m| m.distance(drawn) <= blur.reach_mm()).unwrap_or(x)
     })?)
 }
 

@@ -77,7 +77,7 @@ fn row(label: &str, kind: Kind, scan: &phantom::Settings, known: (bool, Option<f
 }
 
 /// Means over contour points: offset of the contour from the truth, the planar shift in it along the true normal, the
-/// spatial shift by the fitted function's and by the truth's second derivatives.
+/// shift in space by the fitted function and by the truth.
 fn shifts(contours: &Contours, f: &Variational, scene: &Scene) {
     let Some(blur) = contours.blur else { return };
     let mut sums = [0.0; 5];
@@ -88,12 +88,14 @@ fn shifts(contours: &Contours, f: &Variational, scene: &Scene) {
             if p.on_border || contours.cuts.iter().any(|c| (p.position - c.point).dot(c.outward) > -6.0) {
                 continue;
             }
-            let shift = |(_, g, h): (f64, space::V3, space::DMat3)| {
-                let n = g.normalised().unwrap();
-                (blur.spatial_shift_mm(n, &(h * g.length().recip())), n)
+            let drawn = p.position + p.inward * blur.planar_shift_mm(plane, &p);
+            let shift = |f: &dyn Fn(P3) -> (f64, space::V3, space::DMat3)| {
+                let (value, gradient, _) = f(drawn);
+                let level = blur.half_maximum_level(drawn, f).unwrap();
+                ((value - level) / gradient.length(), gradient.normalised().unwrap())
             };
-            let (ours, _) = shift(f.hessian(p.position));
-            let (true_shift, n) = shift(scene.vessel.hessian(p.position));
+            let (ours, _) = shift(&|x| f.hessian(x));
+            let (true_shift, n) = shift(&|x| scene.vessel.hessian(x));
             let planar = blur.planar_shift_mm(plane, &p) * p.inward.dot(n);
             let offset = -scene.vessel.distance(p.position);
             for (s, v) in sums.iter_mut().zip([1.0, offset, planar, ours, true_shift]) {
