@@ -301,3 +301,33 @@ fn the_same_bits_for_any_number_of_threads_and_a_cancel_is_obeyed() {
     cancelled.cancel();
     assert_eq!(run(&cancelled).unwrap_err(), Error::Cancelled);
 }
+
+#[test]
+fn the_junctions_of_two_opposite_side_branches_stay_between_their_mouths() {
+    // their first stretches lean down along the trunk: carried on through it they pass the axis; the node lay 6 mm below the mouths
+    let p = P3::new;
+    let radius = 2.7;
+    let vessel = Vessel::new(&[
+        (p(0.0, 0.0, -60.0), p(0.0, 0.0, 60.0), 9.0),
+        (p(6.0, 4.0, 8.0), p(14.0, 6.0, -14.0), radius),
+        (p(14.0, 6.0, -14.0), p(60.0, 6.0, -20.0), radius),
+        (p(-6.0, 1.0, 1.0), p(-15.0, -1.0, -9.0), radius),
+        (p(-15.0, -1.0, -9.0), p(-60.0, -1.0, -14.0), radius),
+    ]);
+    let ends = [
+        (p(0.0, 0.0, 45.0), V3::Z),
+        (p(0.0, 0.0, -45.0), V3::Z * -1.0),
+        (p(45.0, 6.0, -18.0), V3::X),
+        (p(-45.0, -1.0, -12.3), V3::X * -1.0),
+    ];
+    let (cuts, caps): (Vec<_>, Vec<_>) =
+        ends.iter().enumerate().map(|(i, &(at, out))| opening(i as u32 + 1, at, out)).unzip();
+    let seeds = [p(0.0, 9.0, 20.0), p(0.0, 9.0, -30.0), p(30.0, 6.0, -13.5), p(-30.0, -1.0, -8.0)];
+    let (graph, _) = medial_graph(&vessel, &cuts, &caps, &seeds, &at_spacing(0.6), &ctx()).unwrap();
+    assert_eq!((graph.nodes.iter().filter(|n| n.kind == NodeKind::End).count(), graph.cycles()), (4, 0));
+    for node in graph.nodes.iter().filter(|n| n.kind == NodeKind::Junction) {
+        let off = off_axis(node.position, P3::ORIGIN, V3::Z);
+        assert!(off < 1.5, "{off} mm off the trunk's axis: {:?}", node.position);
+        assert!(node.position.z().abs() < 4.0, "slid along the trunk: {:?}", node.position);
+    }
+}
