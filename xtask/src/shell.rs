@@ -5,6 +5,9 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+/// Commands that take this long tell it: the test command's time is a bar of its own.
+const SLOW_S: u64 = 10;
+
 /// The workspace's root.
 pub(crate) fn root() -> Result<PathBuf> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -23,7 +26,12 @@ pub(crate) fn command(program: impl AsRef<OsStr>) -> Command {
 /// Show and run; an exit code other than 0 is an error.
 pub(crate) fn run(mut command: Command) -> Result<()> {
     eprintln!("+ {}", words(&command));
+    let started = std::time::Instant::now();
     let status = command.status().with_context(|| format!("cannot start {}", words(&command)))?;
+    let took = started.elapsed().as_secs();
+    if took >= SLOW_S {
+        eprintln!("xtask: that took {took} s");
+    }
     if !status.success() {
         bail!("{} ended with {status}", words(&command));
     }
