@@ -22,6 +22,8 @@ pub(crate) enum Command {
     Run(Run),
     /// Change the medial lines of a finished reconstruction and make the vessels anew around them.
     Vary(Vary),
+    /// The angles and branches of many finished reconstructions together.
+    Cohort(Cohort),
     /// Read and check a scan and a plan; nothing is reconstructed.
     Validate(Validate),
     /// A simulated scan with exact truth: DICOM, PNG + plan, NIfTI, truth.json.
@@ -198,6 +200,28 @@ pub(crate) struct Vary {
     #[arg(long)]
     pub(crate) threads: Option<usize>,
     /// Results and errors as JSON, one line a variant.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Cohort {
+    /// Folders of finished reconstructions, or result.json files.
+    #[arg(required = true)]
+    pub(crate) input: Vec<PathBuf>,
+    /// Folder for cohort.csv, cohort.json and cohort.svg.
+    #[arg(long)]
+    pub(crate) out: Option<PathBuf>,
+    /// Only this angle or branch role; may be given several times.
+    #[arg(long)]
+    pub(crate) name: Vec<String>,
+    /// Only this quantity (deg, diameter_mm, area_mm2, ...); may be given several times.
+    #[arg(long)]
+    pub(crate) quantity: Vec<String>,
+    /// Leave out results with warnings.
+    #[arg(long)]
+    pub(crate) without_warnings: bool,
+    /// Rows and spreads as JSON on standard output.
     #[arg(long)]
     pub(crate) json: bool,
 }

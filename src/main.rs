@@ -1,6 +1,7 @@
 //! `vasculum`: parse the arguments, build the configuration, call one function per sub-command.
 
 mod arguments;
+mod cohorts;
 mod demo;
 mod jobs;
 mod phantoms;
@@ -18,6 +19,7 @@ fn main() -> ExitCode {
     match arguments.command {
         Command::Run(a) => jobs::run(&a),
         Command::Vary(a) => variants::vary(&a),
+        Command::Cohort(a) => cohorts::cohort(&a),
         Command::Validate(a) => jobs::validate(&a),
         Command::ExecJob(a) => jobs::exec(&a),
         Command::Phantom(a) => phantoms::write(&a),

@@ -1,5 +1,6 @@
 //! Bytes to types and back: the only crate that knows a file format.
 
+pub mod cohort;
 mod named;
 pub mod plan;
 pub mod problem;
