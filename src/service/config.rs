@@ -15,6 +15,9 @@ pub type Intake = fn(Vec<NamedBytes>) -> Result<Vec<NamedBytes>, Problem>;
 /// Checks the bytes of a plan; every fault at once.
 pub type CheckPlan = fn(&[u8]) -> Result<(), Problem>;
 
+/// Tells what a scan and its plan would be understood as, without a reconstruction. Runs on a blocking thread.
+pub type CheckScan = fn(Vec<NamedBytes>, &str) -> Result<serde_json::Value, Problem>;
+
 /// Who may call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Auth {
@@ -70,6 +73,8 @@ pub struct Config {
     pub intake: Intake,
     /// Checks a plan. Default: any JSON object; the binary wires the artefact crate's reader.
     pub check_plan: CheckPlan,
+    /// Reads a scan for `?validate=true`. Default: null; the binary wires the pipeline's reader.
+    pub check_scan: CheckScan,
 }
 
 impl Default for Config {
@@ -95,6 +100,7 @@ impl Default for Config {
             min_free_disk: 256 << 20,
             intake: Ok,
             check_plan: crate::intake::json_object,
+            check_scan: |_, _| Ok(serde_json::Value::Null),
         }
     }
 }

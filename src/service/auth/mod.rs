@@ -47,6 +47,8 @@ pub enum Action {
     Change,
     /// Read the audit.
     Audit,
+    /// Make and revoke keys, set what holds for the tenant.
+    Administer,
 }
 
 impl Role {
@@ -71,6 +73,7 @@ impl Role {
             Action::Read => self != Self::Auditor,
             Action::Change => matches!(self, Self::Upload | Self::Admin),
             Action::Audit => matches!(self, Self::Auditor | Self::Admin),
+            Action::Administer => self == Self::Admin,
         }
     }
 }
@@ -174,6 +177,11 @@ fn same_origin(headers: &HeaderMap) -> bool {
 pub struct Caller(Principal);
 
 impl Caller {
+    /// The principal, whatever its role: for calls that only say who it is.
+    pub fn known(self) -> Principal {
+        self.0
+    }
+
     /// The principal, if its role may do that.
     ///
     /// # Errors
@@ -212,6 +220,18 @@ impl FromRequestParts<State> for Caller {
             )),
             Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
         }
+    }
+}
+
+/// A caller who may administer the tenant.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Administrator(pub Principal);
+
+impl FromRequestParts<State> for Administrator {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &State) -> Result<Self, Problem> {
+        Caller::from_request_parts(parts, state).await?.may(Action::Administer).map(Self)
     }
 }
 

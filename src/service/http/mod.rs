@@ -1,5 +1,6 @@
 //! The network face: one router per resource, one layer that makes every error a problem, one place for headers.
 
+mod admin;
 mod artefacts;
 mod describe;
 mod events;
@@ -8,12 +9,14 @@ mod health;
 mod jobs;
 mod listen;
 mod multipart;
+mod order;
 mod portal;
 pub(crate) mod problems;
 mod range;
 mod session;
 mod shapes;
 mod stats;
+mod taking;
 mod uploads;
 mod webhooks;
 mod workers;
@@ -47,7 +50,8 @@ const SMALL_BODY: usize = 64 << 10;
         (name = "jobs", description = "Send a scan, follow it, end it"),
         (name = "results", description = "What a job made"),
         (name = "webhooks", description = "Be told when a job ends"),
-        (name = "monitoring", description = "Is it well, and how busy is it")
+        (name = "monitoring", description = "Is it well, and how busy is it"),
+        (name = "administration", description = "Keys and retention of a tenant")
     )
 )]
 struct Document;
@@ -67,12 +71,14 @@ impl utoipa::Modify for Keys {
 fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
+        .merge(order::router())
         .merge(uploads::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
         .merge(workers::router())
         .merge(webhooks::router())
+        .merge(admin::router())
         .merge(session::router())
         .merge(health::router())
 }
