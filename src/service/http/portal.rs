@@ -8,26 +8,26 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 
-/// The 3D view, bundled by build.rs (a small stand-in that says so when npm was missing then).
-const VIEW3D: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/view3d.js"));
+/// Name and bytes of each file of the page, from build.rs.
+const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/portal_files.rs"));
 
-const FILES: &[(&str, &str, &[u8])] = &[
-    ("/", "text/html; charset=utf-8", include_bytes!("../portal/index.html")),
-    ("/portal/app.js", "text/javascript; charset=utf-8", include_bytes!("../portal/app.js")),
-    ("/portal/api.js", "text/javascript; charset=utf-8", include_bytes!("../portal/api.js")),
-    ("/portal/job.js", "text/javascript; charset=utf-8", include_bytes!("../portal/job.js")),
-    ("/portal/plot.js", "text/javascript; charset=utf-8", include_bytes!("../portal/plot.js")),
-    ("/portal/view3d.js", "text/javascript; charset=utf-8", VIEW3D),
-    ("/portal/style.css", "text/css; charset=utf-8", include_bytes!("../portal/style.css")),
-    ("/portal/icon.svg", "image/svg+xml", include_bytes!("../portal/icon.svg")),
-];
-
-/// Routes of the page.
+/// Routes of the page: `/` and `/portal/NAME`.
 pub(super) fn router() -> Router<State> {
-    FILES.iter().fold(Router::new(), |router, (path, media_type, bytes)| {
-        let tag = format!("\"{}\"", digest(bytes));
-        router.route(path, get(move |headers: HeaderMap| async move { file(&headers, media_type, bytes, &tag) }))
+    FILES.iter().fold(Router::new(), |router, (name, bytes)| {
+        let path = if *name == "index.html" { "/".to_owned() } else { format!("/portal/{name}") };
+        let (tag, kind) = (format!("\"{}\"", digest(bytes)), media_type(name));
+        router.route(&path, get(move |headers: HeaderMap| async move { file(&headers, kind, bytes, &tag) }))
     })
+}
+
+fn media_type(name: &str) -> &'static str {
+    match name.rsplit('.').next() {
+        Some("html") => "text/html; charset=utf-8",
+        Some("js") => "text/javascript; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("json") => "application/json",
+        _ => "image/svg+xml",
+    }
 }
 
 fn file(headers: &HeaderMap, media_type: &'static str, bytes: &'static [u8], tag: &str) -> Response {

@@ -1,0 +1,60 @@
+// The page: texts, theme, session, and the way to the views.
+import { showAdmin } from "./admin.js";
+import { showCohort } from "./cohort.js";
+import { showCompare } from "./compare.js";
+import { h, select } from "./dom.js";
+import { notice } from "./faults.js";
+import { showJob } from "./job.js";
+import { showQueue } from "./queue.js";
+import { route } from "./router.js";
+import { showSend } from "./send.js";
+import { endSession, startSession, whoami } from "./session.js";
+import { LANGUAGES, currentLanguage, loadTexts, setLanguage, t } from "./text.js";
+import { applyTheme, nextTheme } from "./theme.js";
+import { onTransfers } from "./transfer.js";
+
+const VIEWS = { jobs: showQueue, job: showJob, send: showSend, compare: showCompare, cohort: showCohort, admin: showAdmin };
+const NAV = ["send", "jobs", "compare", "cohort", "admin"];
+const go = () => route(VIEWS);
+
+function drawHeader() {
+  const running = h("span", { id: "running", class: "badge", hidden: true });
+  const links = NAV.map((name) => h("a", { href: `#/${name}`, "data-view": name }, t(`nav.${name}`), name === "send" ? running : null));
+  const theme = h("button", { type: "button", class: "quiet", id: "theme", onclick: () => { nextTheme(); theme.textContent = t(`theme.${document.documentElement.dataset.theme ?? "auto"}`); } },
+    t(`theme.${document.documentElement.dataset.theme ?? "auto"}`));
+  theme.title = t("theme.label");
+  const language = select(Object.entries(LANGUAGES), currentLanguage(), async (name) => {
+    await setLanguage(name);
+    drawHeader();
+    go();
+  }, { "aria-label": t("language.label"), class: "quiet" });
+  const out = h("button", { type: "button", class: "quiet", id: "sign-out", hidden: true, onclick: () => endSession().then(go).catch(notice) }, t("session.end"));
+  document.getElementById("skip").textContent = t("nav.skip");
+  document.getElementById("header").replaceChildren(
+    h("a", { class: "brand", href: "#/jobs" }, h("img", { src: "/portal/icon.svg", alt: "", width: 26, height: 26 }), "Vasculum"),
+    h("nav", { "aria-label": t("nav.label") }, links),
+    h("div", { class: "tools" }, language, theme, out));
+  document.getElementById("foot").textContent = t("foot.research");
+  whoami().then((who) => {
+    out.hidden = !who.keys;
+    document.querySelector('nav a[data-view="admin"]').hidden = who.role !== "admin" && who.role !== "auditor";
+  }).catch(() => {});
+}
+
+onTransfers((n) => {
+  const badge = document.getElementById("running");
+  if (!badge) return;
+  badge.hidden = n === 0;
+  badge.textContent = String(n);
+  badge.setAttribute("aria-label", t("nav.uploads", { n }));
+});
+// A closed page would break off what is being sent.
+window.addEventListener("beforeunload", (e) => document.getElementById("running")?.hidden === false && e.preventDefault());
+window.addEventListener("fault", (e) => notice(e.detail));
+window.addEventListener("session", drawHeader);
+applyTheme();
+await loadTexts();
+await startSession();
+drawHeader();
+window.addEventListener("hashchange", go);
+go();
