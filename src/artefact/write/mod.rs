@@ -4,6 +4,7 @@
 //!
 //! Everything is made in memory before a byte is written, so that a fault in the last artefact leaves nothing behind.
 
+mod arcs;
 mod atlas;
 mod csv;
 pub mod dicom;
