@@ -22,11 +22,12 @@ function read(name, branches) {
 // {name, index, value, band, vertex, from, to} of each angle that can be drawn.
 export function arcsOf(found, junction) {
   if (!junction) return [];
+  const meeting = found.branches.filter((b) => (junction.branches ?? []).includes(b.id));
   const vertex = junction.axes_point ?? junction.medial_point;
   return (junction.angles ?? []).flatMap((angle, index) => {
     if (angle.value === null) return [];
-    const { parties, rest } = read(angle.name, found.branches);
-    const [first, second] = parties.map((b) => (b ? unit(b.direction) : null));
+    const { parties, rest } = read(angle.name, meeting);
+    const [first, second] = parties.map((b) => (b?.direction ? unit(b.direction) : null));
     const normal = junction.plane_normal ? unit(junction.plane_normal) : null;
     let to = second;
     if (rest === "normal") to = normal;

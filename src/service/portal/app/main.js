@@ -15,14 +15,20 @@ import { onTransfers } from "./transfer.js";
 
 const VIEWS = { jobs: showQueue, job: showJob, send: showSend, compare: showCompare, cohort: showCohort, admin: showAdmin };
 const NAV = ["send", "jobs", "compare", "cohort", "admin"];
+const SIGNS = { auto: "◐", light: "☀", dark: "☾" };
 const go = () => route(VIEWS);
 
 function drawHeader() {
   const running = h("span", { id: "running", class: "badge", hidden: true });
   const links = NAV.map((name) => h("a", { href: `#/${name}`, "data-view": name }, t(`nav.${name}`), name === "send" ? running : null));
-  const theme = h("button", { type: "button", class: "quiet", id: "theme", onclick: () => { nextTheme(); theme.textContent = t(`theme.${document.documentElement.dataset.theme ?? "auto"}`); } },
-    t(`theme.${document.documentElement.dataset.theme ?? "auto"}`));
-  theme.title = t("theme.label");
+  const theme = h("button", { type: "button", class: "quiet", id: "theme", onclick: () => { nextTheme(); tell(); } });
+  const tell = () => {
+    const now = document.documentElement.dataset.theme ?? "auto";
+    theme.textContent = SIGNS[now];
+    theme.title = t(`theme.${now}`);
+    theme.setAttribute("aria-label", t(`theme.${now}`));
+  };
+  tell();
   const language = select(Object.entries(LANGUAGES), currentLanguage(), async (name) => {
     await setLanguage(name);
     drawHeader();

@@ -101,7 +101,7 @@ function draw(view, parts, changed) {
 
 function heading(column, view, changed) {
   const active = column.key === view.sort;
-  return h("th", { scope: "col", class: column.number ? "number" : null, "aria-sort": active ? (view.down ? "descending" : "ascending") : null },
+  return h("th", { scope: "col", class: `${column.number ? "number " : ""}c-${column.key}`, "aria-sort": active ? (view.down ? "descending" : "ascending") : null },
     h("button", { type: "button", class: "sort", "data-key": `sort-${column.key}`, onclick: () => {
       view.down = active ? !view.down : true;
       view.sort = column.key;
@@ -126,11 +126,11 @@ function row(job) {
   const thumb = job.state === "succeeded" ? h("img", { class: "thumb", src: filePath(job.id, "preview.png"), alt: "", loading: "lazy", width: 64, height: 48 }) : h("span", { class: "thumb none", "aria-hidden": "true" });
   return h("tr", {},
     h("td", {}, h("a", { class: "job-link", href: `#/jobs/${job.id}`, title: job.id, "data-key": `open-${job.id}` }, thumb, h("span", {}, name))),
-    h("td", {}, when(job.created_at)),
+    h("td", { class: "c-created" }, when(job.created_at)),
     h("td", { class: "state-cell" }, stateCell(job)),
-    h("td", { class: "number", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
+    h("td", { class: "number c-waited", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
     h("td", { class: "number", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),
-    h("td", { class: "number" }, `${bytes(job.input.bytes)}`, h("br"), h("span", { class: "soft" }, t("count.files", { n: job.input.files }))),
+    h("td", { class: "number c-size" }, `${bytes(job.input.bytes)}`, h("br"), h("span", { class: "soft" }, t("count.files", { n: job.input.files }))),
     h("td", { class: "number" }, job.state === "queued" ? mover(job) : String(job.priority)),
     h("td", {}, h("div", { class: "actions" }, actions(job, { name }))));
 }

@@ -80,10 +80,12 @@ class Viewer {
 
   wallOf(mesh, kind) {
     mesh.geometry.scale(1000, 1000, 1000);
-    const material = new MeshStandardMaterial({ roughness: 0.6, metalness: 0, transparent: true, opacity: OPACITY, side: DoubleSide, depthWrite: false });
+    // Of two surfaces the first is solid: what shines through the second's haze is where they agree.
+    const solid = kind === "side-a";
+    const material = new MeshStandardMaterial({ roughness: 0.6, metalness: 0, transparent: !solid, opacity: solid ? 1 : OPACITY, side: DoubleSide, depthWrite: solid });
     const made = new Mesh(mesh.geometry, material);
     made.userData = { wall: true, kind };
-    made.renderOrder = 2;
+    made.renderOrder = solid ? 0 : 2;
     return made;
   }
 
