@@ -11,30 +11,32 @@ export async function showAdmin(box, { signal }) {
   box.append(h("h1", {}, t("title.admin")), h("p", { class: "soft" }, t("admin.who", { tenant: who.tenant, role: t(`key.${who.role}`) })));
   if (who.role !== "admin" && who.role !== "auditor") return box.append(h("p", { class: "empty" }, t("admin.forbidden")));
   const grid = h("div", { class: "admin-grid" });
+  const audit = h("div", { class: "wide" });
+  // What is done here is seen in the audit at once.
+  const done = () => drawAudit(audit, signal);
   box.append(grid);
   if (who.role === "admin") {
     const keys = h("div", { class: "wide" });
-    grid.append(keys, tenantCard(await json("/v1/tenant", { signal })), await workersCard(signal));
-    await drawKeys(keys, signal);
+    grid.append(keys, tenantCard(await json("/v1/tenant", { signal }), done), await workersCard(signal));
+    await drawKeys(keys, done, signal);
   }
-  const audit = h("div", { class: "wide" });
   grid.append(audit);
-  await drawAudit(audit, signal);
+  await done();
 }
 
-async function drawKeys(box, signal) {
+async function drawKeys(box, done, signal) {
   const { items } = await json("/v1/keys", { signal });
   const rows = items.map((key) => [key.label, t(`key.${key.role}`), when(key.created_at), key.revoked_at ? t("key.revoked", { when: when(key.revoked_at) }) : t("key.valid"),
     key.revoked_at ? "" : button(t("key.revoke"), async () => {
       if (!(await sure(t("key.revoke_sure", { label: key.label }), t("key.revoke")))) return;
       await call(`/v1/keys/${key.id}`, { method: "DELETE" });
-      await drawKeys(box, signal);
+      await Promise.all([drawKeys(box, done, signal), done()]);
     }, { class: "quiet small", "aria-label": `${t("key.revoke")} ${key.label}` })]);
   const columns = ["label", "role", "made", "state", "actions"].map((k) => ({ title: t(`key.${k}`) }));
-  box.replaceChildren(card(t("key.title"), table(t("key.title"), columns, rows), keyForm(box, signal)));
+  box.replaceChildren(card(t("key.title"), table(t("key.title"), columns, rows), keyForm(box, done, signal)));
 }
 
-function keyForm(box, signal) {
+function keyForm(box, done, signal) {
   const label = h("input", { required: true, maxlength: 100, autocomplete: "off" });
   const state = { role: "upload" };
   const role = select(ROLES.map((r) => [r, t(`key.${r}`)]), state.role, (value) => { state.role = value; });
@@ -43,8 +45,8 @@ function keyForm(box, signal) {
       e.preventDefault();
       try {
         const made = await (await post("/v1/keys", { label: label.value.trim(), role: state.role })).json();
-        await drawKeys(box, signal);
         showKey(made.key);
+        await Promise.all([drawKeys(box, done, signal), done()]);
       } catch (error) {
         window.dispatchEvent(new CustomEvent("fault", { detail: error }));
       }
@@ -61,7 +63,7 @@ function showKey(key) {
   dialog.showModal();
 }
 
-function tenantCard(tenant) {
+function tenantCard(tenant, done) {
   const number = (value, min) => h("input", { type: "number", min, step: "any", value: value ?? "", placeholder: t("tenant.unbounded") });
   const [days, running] = [number(tenant.retention_days, "0.001"), number(tenant.max_running, "1")];
   const said = h("p", { class: "soft", role: "status" });
@@ -73,6 +75,7 @@ function tenantCard(tenant) {
       try {
         await call("/v1/tenant", { method: "PUT", headers: { "content-type": "application/json" }, body: JSON.stringify({ retention_days: read(days), max_running: read(running) }) });
         said.textContent = t("tenant.saved");
+        await done();
       } catch (error) {
         window.dispatchEvent(new CustomEvent("fault", { detail: error }));
       }

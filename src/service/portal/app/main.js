@@ -6,7 +6,7 @@ import { h, select } from "./dom.js";
 import { notice } from "./faults.js";
 import { showJob } from "./job.js";
 import { showQueue } from "./queue.js";
-import { route } from "./router.js";
+import { clear, route } from "./router.js";
 import { showSend } from "./send.js";
 import { endSession, startSession, whoami } from "./session.js";
 import { LANGUAGES, currentLanguage, loadTexts, setLanguage, t } from "./text.js";
@@ -34,7 +34,7 @@ function drawHeader() {
     drawHeader();
     go();
   }, { "aria-label": t("language.label"), class: "quiet" });
-  const out = h("button", { type: "button", class: "quiet", id: "sign-out", hidden: true, onclick: () => endSession().then(go).catch(notice) }, t("session.end"));
+  const out = h("button", { type: "button", class: "quiet", id: "sign-out", hidden: true, onclick: () => { clear(); endSession().then(go).catch(notice); } }, t("session.end"));
   document.getElementById("skip").textContent = t("nav.skip");
   document.getElementById("header").replaceChildren(
     h("a", { class: "brand", href: "#/jobs" }, h("img", { src: "/portal/icon.svg", alt: "", width: 26, height: 26 }), "Vasculum"),

@@ -21,6 +21,12 @@ export function setQuery(values) {
   history.replaceState(null, "", `#/${[name, ...params].join("/")}${text ? `?${text}` : ""}`);
 }
 
+// Ends the present view and takes away what it showed.
+export function clear() {
+  leave.abort();
+  document.getElementById("view").replaceChildren();
+}
+
 export async function route(views) {
   leave.abort();
   leave = new AbortController();
