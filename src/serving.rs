@@ -122,6 +122,7 @@ fn config(a: Serve) -> Config {
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
+        frame_ancestors: a.frame_ancestors,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         ..data_config(a.data)
     }

@@ -62,6 +62,8 @@ pub struct Config {
     pub sweep_seconds: u64,
     /// Hosts to which webhooks may go though they lie in a network that is not public, by plain http too. Default none.
     pub webhook_hosts: Vec<String>,
+    /// Origins whose pages may show a result's view in a frame, such as `https://portal.example.org`. Default none.
+    pub frame_ancestors: Vec<String>,
     /// Largest request body, bytes. Default 2 GiB.
     pub max_body: u64,
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
@@ -90,6 +92,7 @@ impl Default for Config {
             job_seconds: 6 * 3600,
             sweep_seconds: 3600,
             webhook_hosts: Vec::new(),
+            frame_ancestors: Vec::new(),
             workers: 1,
             threads: 0,
             auth: Auth::Required,

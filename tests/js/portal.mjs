@@ -1,12 +1,13 @@
 // The portal as a user meets it, in headless Chromium against the binary: sign in, send a scan whose upload breaks off and
 // whose session ends on the way, see what was understood, reconstruct, read the three angles (equal to result.json of the
 // command line), point from 3D to slice and back, correct a role, compare, download, print on one page, cancel, mend a failed
-// job, read the cohort, make a key. On every view in light and dark: axe-core finds nothing. No console error, no request
+// job, read the cohort, make a key, show a result in another page. On every view in light and dark: axe-core finds nothing. No console error, no request
 // to another origin, a policy without unsafe-*, at most 400 kB of code. Leaves screenshots in VASCULUM_WORK.
 import assert from "node:assert/strict";
 import { spawn } from "node:child_process";
-import { createRequire } from "node:module";
 import { mkdtempSync, readdirSync, readFileSync, rmSync } from "node:fs";
+import { createServer } from "node:http";
+import { createRequire } from "node:module";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { brotliCompressSync } from "node:zlib";
@@ -23,8 +24,15 @@ const ANGLES = {
   distal_normal: "Distal – normal of the plane",
 };
 
+// A page of another origin, which shows what its address names in a frame.
+const host = createServer((request, response) => {
+  response.setHeader("content-type", "text/html");
+  response.end(`<title>Host</title><iframe title="result" width="1200" height="700" src="${decodeURIComponent(request.url.slice(2))}"></iframe>`);
+});
+await new Promise((resolve) => host.listen(0, "127.0.0.1", resolve));
+const hostAddress = `http://127.0.0.1:${host.address().port}`;
 const data = mkdtempSync(join(tmpdir(), "vasculum-portal-"));
-const server = spawn(binary, ["serve", "--listen", "127.0.0.1:0", "--data-dir", data], { env: { ...process.env, RUST_LOG: "error" } });
+const server = spawn(binary, ["serve", "--listen", "127.0.0.1:0", "--data-dir", data, "--frame-ancestor", hostAddress], { env: { ...process.env, RUST_LOG: "error" } });
 const [address, admin] = await new Promise((resolve, reject) => {
   let text = "";
   setTimeout(() => reject(new Error("the service does not listen")), 20_000).unref();
@@ -327,6 +335,31 @@ async function cohort() {
   await shot("cohort");
 }
 
+// Another page shows the result by a link, and nothing else of the portal.
+async function framed(id) {
+  await open(`#/jobs/${id}`, ".scene canvas");
+  await page.getByRole("button", { name: "Link for a frame" }).click();
+  const link = await page.getByRole("textbox", { name: "Link" }).inputValue();
+  await accessible("a link");
+  await page.getByRole("button", { name: "Close" }).click();
+  const stranger = await browser.newContext({ viewport: { width: 1280, height: 800 } });
+  const outside = await stranger.newPage();
+  const wrong = [];
+  outside.on("pageerror", (e) => wrong.push(String(e)));
+  outside.on("console", (m) => m.type() === "error" && wrong.push(m.text()));
+  await outside.goto(`${hostAddress}/?${encodeURIComponent(link)}`);
+  const frame = outside.frameLocator("iframe");
+  await frame.locator(".tag").nth(2).waitFor({ timeout: LONG });
+  await frame.locator(".slice-tools output", { hasText: "mm" }).waitFor();
+  assert.equal(await frame.getByRole("button", { name: /Erase|Run again|Measure/ }).count(), 0);
+  assert.equal(await frame.getByRole("link", { name: "Jobs" }).count(), 0);
+  await outside.screenshot({ path: join(work, "portal-framed.png") });
+  assert.deepEqual(wrong, []);
+  await outside.goto(`${hostAddress}/?${encodeURIComponent(`${address}/`)}`);
+  await until("a refused frame", () => wrong.some((text) => /frame-ancestors/.test(text)));
+  await stranger.close();
+}
+
 async function german() {
   await page.getByLabel("Language").selectOption("de");
   await page.getByRole("link", { name: "Aufträge" }).waitFor();
@@ -368,6 +401,7 @@ try {
   await queue();
   await mendFailed();
   await cohort();
+  await framed(id);
   await german();
   await lean(id);
   const code = [...scripts.values()].reduce((n, body) => n + brotliCompressSync(body).length, 0);
@@ -380,6 +414,8 @@ try {
 }
 await browser.close();
 server.kill();
+host.close();
+host.closeAllConnections();
 await new Promise((resolve) => server.once("exit", resolve));
 rmSync(data, { recursive: true, force: true });
 if (failed) {

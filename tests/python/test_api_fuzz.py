@@ -65,7 +65,7 @@ PLACES = [
     ("DELETE", f"/v1/jobs/{ID}"), ("POST", "/v1/webhooks"), ("GET", "/v1/webhooks"), ("DELETE", f"/v1/webhooks/{ID}"),
     ("OPTIONS", "/v1/uploads"), ("POST", "/v1/uploads"), ("HEAD", "/v1/uploads/[0-9a-f]{96}"),
     ("PATCH", "/v1/uploads/[0-9a-f]{96}"), ("DELETE", "/v1/uploads/[0-9a-f]{96}"),
-    ("GET", "/v1/jobs"), ("POST", "/v1/jobs/cancel"), ("GET", "/v1/audit"), ("GET", "/v1/session"), ("GET", f"/v1/jobs/{ID}/plan"), ("GET", "/v1/keys"), ("POST", "/v1/keys"),
+    ("GET", "/v1/jobs"), ("POST", "/v1/jobs/cancel"), ("GET", "/v1/audit"), ("GET", "/v1/session"), ("GET", f"/v1/jobs/{ID}/plan"), ("POST", f"/v1/jobs/{ID}/links"), ("GET", "/v1/keys"), ("POST", "/v1/keys"),
     ("GET", "/v1/tenant"), ("PUT", "/v1/tenant"), ("GET", "/v1/stats"), ("GET", "/v1/workers"),
 ]
 

@@ -5,6 +5,7 @@
 //! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
 
 pub mod keys;
+pub mod links;
 mod pace;
 
 use crate::config::Auth;
@@ -218,6 +219,9 @@ impl FromRequestParts<State> for Caller {
                 "auth.origin",
                 "A page of another origin may not change anything here by cookie.",
             )),
+            Some(Sent::Bearer(token)) if token.starts_with(links::LINK_PREFIX) => {
+                links::caller(state.queue.db(), token, parts.uri.path(), safe).await
+            }
             Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
         }
     }

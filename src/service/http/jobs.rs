@@ -167,7 +167,7 @@ async fn create(
     };
     let submitted = store_and_submit(&state, &job, &input, files).await;
     drop(budget);
-    let (row, replayed) = match submitted? {
+    let (mut row, replayed) = match submitted? {
         Submitted::New(row) => (*row, false),
         Submitted::Replayed(row) => (*row, true),
         Submitted::Mismatch(row) => {
@@ -179,7 +179,7 @@ async fn create(
         }
     };
     if !replayed {
-        state.audit(&who, &trace.0, "job.create", &row.id).await?;
+        row.sent_by = state.audit_sent(&who, &trace.0, &row.id).await?;
     }
     if let Some(id) = resumable {
         crate::uploads::used(state.queue.db(), &who.tenant, id).await?;

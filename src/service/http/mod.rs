@@ -7,6 +7,7 @@ mod events;
 mod guard;
 mod health;
 mod jobs;
+mod links;
 mod listen;
 mod multipart;
 mod order;
@@ -72,6 +73,7 @@ fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
         .merge(order::router())
+        .merge(links::router())
         .merge(uploads::router())
         .merge(events::router())
         .merge(artefacts::router())
@@ -95,7 +97,7 @@ pub(crate) fn router(state: State) -> Router {
     let (api, mut document) = documented().split_for_parts();
     describe::complete(&mut document);
     let document = Arc::new(document);
-    let page = portal::router().layer(CompressionLayer::new());
+    let page = portal::router(&state.config.frame_ancestors).layer(CompressionLayer::new());
     let described = Router::new()
         .route("/openapi.json", get(move || async move { axum::Json(Arc::clone(&document)) }))
         .layer(CompressionLayer::new());

@@ -1,6 +1,6 @@
 //! The page, embedded in the binary: no file is read and nothing is fetched from elsewhere at run time.
 
-use super::guard::PAGE_POLICY;
+use super::guard::page_policy;
 use crate::state::State;
 use crate::store::digest;
 use axum::Router;
@@ -11,12 +11,18 @@ use axum::routing::get;
 /// Name and bytes of each file of the page, from build.rs.
 const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/portal_files.rs"));
 
-/// Routes of the page: `/` and `/portal/NAME`.
-pub(super) fn router() -> Router<State> {
-    FILES.iter().fold(Router::new(), |router, (name, bytes)| {
-        let path = if *name == "index.html" { "/".to_owned() } else { format!("/portal/{name}") };
+/// Routes of the page: `/`, `/embed` (the same for a frame of `frame_ancestors`) and `/portal/NAME`.
+pub(super) fn router(frame_ancestors: &[String]) -> Router<State> {
+    let serve = |router: Router<State>, path: &str, (name, bytes): (&str, &'static [u8]), policy: String| {
         let (tag, kind) = (format!("\"{}\"", digest(bytes)), media_type(name));
-        router.route(&path, get(move |headers: HeaderMap| async move { file(&headers, kind, bytes, &tag) }))
+        router.route(path, get(move |headers: HeaderMap| async move { file(&headers, kind, bytes, &tag, &policy) }))
+    };
+    FILES.iter().fold(Router::new(), |router, &(name, bytes)| {
+        if name != "index.html" {
+            return serve(router, &format!("/portal/{name}"), (name, bytes), page_policy(&[]));
+        }
+        let router = serve(router, "/", (name, bytes), page_policy(&[]));
+        serve(router, "/embed", (name, bytes), page_policy(frame_ancestors))
     })
 }
 
@@ -30,11 +36,11 @@ fn media_type(name: &str) -> &'static str {
     }
 }
 
-fn file(headers: &HeaderMap, media_type: &'static str, bytes: &'static [u8], tag: &str) -> Response {
+fn file(headers: &HeaderMap, media_type: &'static str, bytes: &'static [u8], tag: &str, policy: &str) -> Response {
     let seen = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
     let common = [
         (header::CONTENT_TYPE, media_type),
-        (header::CONTENT_SECURITY_POLICY, PAGE_POLICY),
+        (header::CONTENT_SECURITY_POLICY, policy),
         (header::CACHE_CONTROL, "no-cache"),
         (header::ETAG, tag),
     ];

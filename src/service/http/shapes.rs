@@ -60,6 +60,8 @@ pub(super) struct Job {
     pub max_attempts: i64,
     /// Whether a cancel is on its way to the worker.
     pub cancel_requested: bool,
+    /// Who sent it: the label of the key.
+    pub sent_by: Option<String>,
     /// What was sent.
     pub input: InputShape,
     /// RFC 3339, UTC.
@@ -167,6 +169,7 @@ impl From<JobRow> for Job {
             attempt: row.attempt,
             max_attempts: row.max_attempts,
             cancel_requested: row.cancel_requested,
+            sent_by: row.sent_by,
             created_at: rfc3339(row.created_at),
             started_at: row.started_at.and_then(rfc3339),
             finished_at: row.finished_at.and_then(rfc3339),

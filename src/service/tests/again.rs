@@ -117,10 +117,76 @@ async fn an_administrator_makes_and_revokes_keys_and_sets_retention() {
     let odd = call(Method::PUT, "/v1/tenant", &admin).json(&json!({"retention_days": -1.0}));
     assert_eq!(problem(odd.send().await.unwrap(), 422).await, "bad_request");
     let job = body(service.upload(&json!({})).bearer_auth(&admin).send().await.unwrap()).await;
+    assert_eq!(job["sent_by"], "key", "the label of the key that sent it");
     let path = format!("/v1/jobs/{}?wait=15", job["id"].as_str().unwrap());
     call(Method::GET, &path, &admin).send().await.unwrap();
     let kept = "SELECT expires_at - finished_at AS kept FROM job WHERE tenant = 'north'";
     let row = db.row(service::db::Scope::System, kept, Vec::new()).await.unwrap().unwrap();
     assert_eq!(row.get::<i64>("kept").unwrap(), 129_600_000);
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_link_shows_one_job_for_its_time_and_no_longer_than_its_key() {
+    let service = Service::with(|config| config.auth = Auth::Required).await;
+    let db = open_database(&support::config(service.folder.path())).await.unwrap();
+    let new = || NewKey { role: Role::Upload, ..NewKey::default() };
+    let (key, other) = (keys::create(&db, new()).await.unwrap(), keys::create(&db, new()).await.unwrap());
+    let send =
+        async || body(service.upload(&json!({})).bearer_auth(&key).send().await.unwrap()).await["id"].to_string();
+    let (shown, hidden) = (send().await.replace('"', ""), send().await.replace('"', ""));
+    let call = |method: Method, path: &str, token: &str| service.request(method, path).bearer_auth(token).send();
+    let made = |seconds: u32, key: String| {
+        let path = format!("/v1/jobs/{shown}/links?seconds={seconds}");
+        async move { body(call(Method::POST, &path, &key).await.unwrap()).await }
+    };
+    let link = made(60, key.clone()).await;
+    let token = link["token"].as_str().unwrap().to_owned();
+    assert_eq!(link["url"], format!("/embed#/jobs/{shown}?link={token}"));
+    let path = format!("/v1/jobs/{shown}");
+    let seen = call(Method::GET, &format!("{path}?wait=15"), &token).await.unwrap();
+    assert_eq!(body(seen).await["state"], "succeeded");
+    let file = call(Method::GET, &format!("{path}/artefacts/angles.csv"), &token).await.unwrap();
+    assert_eq!(file.status(), StatusCode::OK);
+    // Anything else, any change, any other job is refused; so is a token that was touched.
+    let (head, mac) = token.rsplit_once('.').unwrap();
+    let (id, expires) = head.rsplit_once('.').unwrap();
+    let longer = format!("{id}.{}.{mac}", expires.parse::<u64>().unwrap() + 1);
+    for (method, path, token) in [
+        (Method::GET, format!("/v1/jobs/{hidden}"), token.clone()),
+        (Method::GET, "/v1/jobs".to_owned(), token.clone()),
+        (Method::GET, "/v1/stats".to_owned(), token.clone()),
+        (Method::DELETE, path.clone(), token.clone()),
+        (Method::POST, format!("{path}/links"), token.clone()),
+        (Method::GET, path.clone(), longer),
+        (Method::GET, path.clone(), format!("{head}.AAAA")),
+        (Method::GET, path.clone(), "vsl_".to_owned()),
+    ] {
+        assert_eq!(problem(call(method, &path, &token).await.unwrap(), 401).await, "auth.link", "{path} {token}");
+    }
+    assert_eq!(
+        problem(call(Method::POST, &format!("{path}/links?seconds=0"), &key).await.unwrap(), 400).await,
+        "bad_request"
+    );
+    let brief = made(1, key.clone()).await["token"].as_str().unwrap().to_owned();
+    tokio::time::sleep(std::time::Duration::from_millis(2100)).await;
+    assert_eq!(problem(call(Method::GET, &path, &brief).await.unwrap(), 401).await, "auth.link");
+    let theirs = made(60, other).await["token"].as_str().unwrap().to_owned();
+    let maker = theirs.trim_start_matches("vsl_").split('.').next().unwrap();
+    assert!(keys::revoke(&db, maker).await.unwrap());
+    assert_eq!(problem(call(Method::GET, &path, &theirs).await.unwrap(), 401).await, "auth.link");
+    assert_eq!(call(Method::GET, &path, &token).await.unwrap().status(), StatusCode::OK);
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_named_pages_may_frame_a_result_and_none_the_portal() {
+    let service = Service::with(|config| config.frame_ancestors = vec!["https://portal.example.org".to_owned()]).await;
+    let policy = |path: &'static str| {
+        let sent = service.get(path);
+        async move { sent.await.headers()["content-security-policy"].to_str().unwrap().to_owned() }
+    };
+    assert!(policy("/embed").await.ends_with("frame-ancestors https://portal.example.org"));
+    assert!(policy("/").await.ends_with("frame-ancestors 'none'"));
     service.stop().await;
 }

@@ -47,6 +47,7 @@ const RULES: &[(&str, &str, Rule)] = &[
     ("GET", "/v1/tenant", Rule::Administer),
     ("PUT", "/v1/tenant", Rule::Administer),
     ("GET", "/v1/jobs/{id}/plan", Rule::Read),
+    ("POST", "/v1/jobs/{id}/links", Rule::Change),
     ("POST", "/v1/jobs/{id}/priority", Rule::Change),
     ("GET", "/v1/stats", Rule::Read),
     ("GET", "/v1/workers", Rule::Read),

@@ -1,6 +1,7 @@
 // One job: what happens, why it failed, or its result.
 import { check } from "./check.js";
 import { announce, button, h, sure } from "./dom.js";
+import { embedded, shareButton } from "./embed.js";
 import { problemBox } from "./faults.js";
 import { call, jobPath, json, post } from "./net.js";
 import { actions, isFinal, ran, stageName, stateCell, waited } from "./queue.js";
@@ -13,6 +14,8 @@ const STAGES = ["read", "contours", "fit", "polygonise", "smooth", "mesh", "skel
 export async function showJob(box, { params, query, signal }) {
   const id = params[0];
   box.append(h("p", { class: "busy", role: "status" }, t("job.reading")));
+  // The viewer's code is on its way while the numbers are.
+  import("./view3d.js").catch(() => {});
   let job = await json(jobPath(id), { signal });
   const parts = { line: h("div", { class: "state-line" }), steps: h("ol", { class: "steps" }) };
   draw(box, job, parts, signal);
@@ -80,14 +83,14 @@ function draw(box, job, parts, signal) {
     const next = await (await post("/v1/jobs", { job: job.id })).json();
     location.hash = `#/jobs/${next.id}`;
   }, { class: "quiet" }) : null;
-  const report = job.state === "succeeded" ? h("a", { class: "button", href: `${jobPath(job.id)}/artefacts/report.html`, target: "_blank", rel: "noopener" }, t("job.report")) : null;
+  const report = job.state === "succeeded" && !embedded ? h("a", { class: "button", href: `${jobPath(job.id)}/artefacts/report.html`, target: "_blank", rel: "noopener" }, t("job.report")) : null;
   box.replaceChildren(
     h("div", { class: "title" },
       h("h1", {}, t("job.title", { name })), parts.line,
-      h("div", { class: "actions" }, report, actions(job, { name, after: again }), rerun, isFinal(job) ? erase : null)),
-    h("p", { class: "soft facts-line" }, t("job.facts", { when: when(job.created_at), files: t("count.files", { n: job.input.files }), size: bytes(job.input.bytes), waited: duration(waited(job)), ran: duration(ran(job)) })),
+      h("div", { class: "actions" }, report, embedded ? null : [actions(job, { name, after: again }), rerun, job.state === "succeeded" ? shareButton(job) : null, isFinal(job) ? erase : null])),
+    h("p", { class: "soft facts-line" }, t("job.facts", { when: [when(job.created_at), job.sent_by === "open" ? "" : job.sent_by].filter(Boolean).join(", "), files: t("count.files", { n: job.input.files }), size: bytes(job.input.bytes), waited: duration(waited(job)), ran: duration(ran(job)) })),
     parts.steps);
   progress(job, parts);
-  if (job.error) box.append(problemBox(job.error, t("job.why")), mending(job, signal));
+  if (job.error) box.append(problemBox(job.error, t("job.why")), embedded ? "" : mending(job, signal));
   if (job.state === "cancelled") box.append(h("p", { class: "empty" }, t("job.cancelled")));
 }

@@ -3,6 +3,7 @@ import { showAdmin } from "./admin.js";
 import { showCohort } from "./cohort.js";
 import { showCompare } from "./compare.js";
 import { h, select } from "./dom.js";
+import { embedded, startEmbedded } from "./embed.js";
 import { notice } from "./faults.js";
 import { showJob } from "./job.js";
 import { showQueue } from "./queue.js";
@@ -31,6 +32,7 @@ function drawHeader() {
   tell();
   const language = select(Object.entries(LANGUAGES), currentLanguage(), async (name) => {
     await setLanguage(name);
+    document.getElementById("foot").textContent = t("foot.research");
     drawHeader();
     go();
   }, { "aria-label": t("language.label"), class: "quiet" });
@@ -40,7 +42,6 @@ function drawHeader() {
     h("a", { class: "brand", href: "#/jobs" }, h("img", { src: "/portal/icon.svg", alt: "", width: 26, height: 26 }), "Vasculum"),
     h("nav", { "aria-label": t("nav.label") }, links),
     h("div", { class: "tools" }, language, theme, out));
-  document.getElementById("foot").textContent = t("foot.research");
   whoami().then((who) => {
     out.hidden = !who.keys;
     document.querySelector('nav a[data-view="admin"]').hidden = who.role !== "admin" && who.role !== "auditor";
@@ -60,7 +61,11 @@ window.addEventListener("fault", (e) => notice(e.detail));
 window.addEventListener("session", drawHeader);
 applyTheme();
 await loadTexts();
-await startSession();
-drawHeader();
+if (embedded) startEmbedded();
+else {
+  await startSession();
+  drawHeader();
+}
+document.getElementById("foot").textContent = t("foot.research");
 window.addEventListener("hashchange", go);
 go();

@@ -10,6 +10,12 @@ export class Fault extends Error {
 }
 
 let renew = null;
+let token = null;
+
+// Calls from now on carry this token instead of the session.
+export function useToken(text) {
+  token = text;
+}
 
 // Says how a new session is had: a function that resolves once there is one.
 export function onSignedOut(handler) {
@@ -25,7 +31,8 @@ export async function call(path, options = {}) {
   for (;;) {
     let response;
     try {
-      response = await fetch(path, { credentials: "same-origin", ...options });
+      const headers = token ? { ...options.headers, authorization: `Bearer ${token}` } : options.headers;
+      response = await fetch(path, { credentials: "same-origin", ...options, headers });
     } catch (error) {
       if (error.name === "AbortError") throw error;
       throw new Fault({ status: 0, code: "offline", detail: t("fault.offline") });

@@ -79,7 +79,7 @@ function tiles(box, stats, workers) {
 }
 
 const matches = (job, text) =>
-  [job.id, job.state, t(`state.${job.state}`), job.stage, job.error?.code, job.error?.detail, job.input.digest].some((part) => part?.toLowerCase().includes(text));
+  [job.id, job.state, t(`state.${job.state}`), job.stage, job.error?.code, job.error?.detail, job.sent_by, job.input.digest].some((part) => part?.toLowerCase().includes(text));
 
 function draw(view, parts, changed) {
   const column = COLUMNS.find((c) => c.key === view.sort) ?? COLUMNS[0];
@@ -126,7 +126,7 @@ function row(job) {
   const thumb = job.state === "succeeded" ? h("img", { class: "thumb", src: filePath(job.id, "preview.png"), alt: "", loading: "lazy", width: 64, height: 48 }) : h("span", { class: "thumb none", "aria-hidden": "true" });
   return h("tr", {},
     h("td", {}, h("a", { class: "job-link", href: `#/jobs/${job.id}`, title: job.id, "data-key": `open-${job.id}` }, thumb, h("span", {}, name))),
-    h("td", { class: "c-created" }, when(job.created_at)),
+    h("td", { class: "c-created" }, when(job.created_at), job.sent_by && job.sent_by !== "open" ? [h("br"), h("span", { class: "soft" }, job.sent_by)] : null),
     h("td", { class: "state-cell" }, stateCell(job)),
     h("td", { class: "number c-waited", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
     h("td", { class: "number", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),

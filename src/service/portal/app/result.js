@@ -3,7 +3,8 @@
 import { along } from "./along.js";
 import { angleCard, distanceCard, firstShown } from "./angles.js";
 import { card, field, h, select } from "./dom.js";
-import { filePath, json, jobPath, lasting } from "./net.js";
+import { embedded } from "./embed.js";
+import { call, filePath, json, jobPath, lasting } from "./net.js";
 import { files } from "./files.js";
 import { branchCard, qualityCard } from "./quality.js";
 import { rolesPanel } from "./roles.js";
@@ -56,22 +57,28 @@ export async function showResult(box, job, { signal }) {
   function drawAngles() {
     const distance = h("div", { class: "contents" });
     const curve = (names) => distance.replaceChildren(...[distanceCard(shown.junction, names)].filter(Boolean));
-    angles.replaceChildren(...[chooser, shown.junction ? angleCard(shown.junction, (names) => { three.angles(shown.junction, names); curve(names); }) : card(t("angles.title"), h("p", {}, t("angles.none"))), rolesPanel(job, found, signal)].filter(Boolean));
+    angles.replaceChildren(...[chooser, shown.junction ? angleCard(shown.junction, (names) => { three.angles(shown.junction, names); curve(names); }) : card(t("angles.title"), h("p", {}, t("angles.none"))), embedded ? null : rolesPanel(job, found, signal)].filter(Boolean));
     if (shown.junction) curve(firstShown(shown.junction));
     curves.replaceChildren(...[distance, along(found, focus)].filter(Boolean));
     three.angles(shown.junction, firstShown(shown.junction));
   }
   shell.replaceChildren(warnings(found.warnings), h("div", { class: "result-top" }, views, angles), curves,
-    h("div", { class: "result-tables" }, h("div", { class: "stack" }, branchCard(found), qualityCard(found)), files(list.items)));
+    h("div", { class: "result-tables" }, h("div", { class: "stack" }, branchCard(found), qualityCard(found)), embedded ? null : files(list.items)));
   drawAngles();
   await slicesBeside(views, job, list.items, { focus, three, shown }, signal);
+}
+
+// By a call, so that a link's token serves too.
+async function pictureOf(path, signal) {
+  const address = URL.createObjectURL(await (await call(path, { signal })).blob());
+  return picture(address).finally(() => URL.revokeObjectURL(address));
 }
 
 async function slicesBeside(views, job, list, { focus, three, shown }, signal) {
   const box = h("div", { class: "pane" }, h("h2", {}, t("slices.title")));
   views.append(box);
   if (!list.some((f) => f.name === "slices.json")) return box.append(h("p", { class: "empty" }, t("slices.none")));
-  const [atlas, image] = await Promise.all([lasting(filePath(job.id, "slices.json")), picture(filePath(job.id, "slices.jpg"))]);
+  const [atlas, image] = await Promise.all([lasting(filePath(job.id, "slices.json")), pictureOf(filePath(job.id, "slices.jpg"), signal)]);
   if (signal.aborted) return;
   const part = {};
   const slices = new Slices(atlas, image, {
