@@ -70,7 +70,10 @@ watch(page);
 
 const api = async (path, options = {}) => fetch(address + path, { ...options, headers: { authorization: `Bearer ${admin}`, ...options.headers } });
 const read = async (path) => (await api(path)).json();
-const shot = (name) => page.screenshot({ path: join(work, `portal-${name}.png`) });
+const shot = async (name) => {
+  await page.evaluate(() => window.scrollTo(0, 0));
+  await page.screenshot({ path: join(work, `portal-${name}.png`) });
+};
 const until = async (what, check) => {
   for (let k = 0; k < 240; k += 1) {
     const found = await check();

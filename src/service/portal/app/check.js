@@ -43,7 +43,7 @@ async function look(panel) {
   announce(t("check.done"));
   if (!told) return found.replaceChildren(h("p", {}, t("check.nothing")));
   panel.slices = null;
-  const refusal = told.refusal ? problemBox(told.refusal, t("check.no_vessel")) : null;
+  const refusal = told.refusal && told.refusal.code !== transfer.known ? problemBox(told.refusal, t("check.no_vessel")) : null;
   const warnings = (told.warnings ?? []).map((w) => h("li", {}, h("code", {}, w.code), ` ${w.message}${place(w.where) ? ` (${place(w.where)})` : ""}`));
   const view = h("div", { class: "check-picture" });
   found.replaceChildren(...[refusal, h("div", { class: "check-grid" }, view,

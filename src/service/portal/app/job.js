@@ -66,7 +66,7 @@ function mending(job, signal) {
   const open = button(t("job.mend"), async () => {
     const plan = await json(`${jobPath(job.id)}/plan`, { signal });
     open.hidden = true;
-    check(box, new Held(job.id, plan), signal);
+    check(box, new Held(job.id, plan, job.error.code), signal);
   }, { id: "mend" });
   return h("section", { class: "card mend", "aria-label": t("job.mend") }, open, box);
 }

@@ -67,7 +67,8 @@ async function refresh(view, parts, changed, signal) {
 function tiles(box, stats, workers) {
   const memory = workers.reduce((n, w) => n + w.memory_mb, 0);
   const slots = workers.reduce((n, w) => n + w.slots, 0);
-  const busy = workers.reduce((n, w) => n + w.busy, 0);
+  // The roll is written every few seconds; what this process holds is known at once.
+  const busy = Math.max(stats.workers_busy, workers.reduce((n, w) => n + w.busy, 0));
   const shown = [
     ["stats.waiting", String(stats.jobs.queued), stats.jobs.queued > 0 ? t("stats.oldest", { time: duration(stats.oldest_queued_s) }) : t("stats.none_waiting")],
     ["stats.running", String(stats.jobs.running), t("stats.workers", { busy, slots })],
@@ -126,10 +127,10 @@ function row(job) {
   const thumb = job.state === "succeeded" ? h("img", { class: "thumb", src: filePath(job.id, "preview.png"), alt: "", loading: "lazy", width: 64, height: 48 }) : h("span", { class: "thumb none", "aria-hidden": "true" });
   return h("tr", {},
     h("td", {}, h("a", { class: "job-link", href: `#/jobs/${job.id}`, title: job.id, "data-key": `open-${job.id}` }, thumb, h("span", {}, name))),
-    h("td", { class: "c-created" }, when(job.created_at), job.sent_by && job.sent_by !== "open" ? [h("br"), h("span", { class: "soft" }, job.sent_by)] : null),
+    h("td", { class: "c-created" }, when(job.created_at, "short"), job.sent_by && job.sent_by !== "open" ? [h("br"), h("span", { class: "soft" }, job.sent_by)] : null),
     h("td", { class: "state-cell" }, stateCell(job)),
     h("td", { class: "number c-waited", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
-    h("td", { class: "number", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),
+    h("td", { class: "number c-ran", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),
     h("td", { class: "number c-size" }, `${bytes(job.input.bytes)}`, h("br"), h("span", { class: "soft" }, t("count.files", { n: job.input.files }))),
     h("td", { class: "number" }, job.state === "queued" ? mover(job) : String(job.priority)),
     h("td", {}, h("div", { class: "actions" }, actions(job, { name }))));

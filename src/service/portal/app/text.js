@@ -47,8 +47,8 @@ export function signed(x, digits = 1) {
   return x > 0 && /[1-9]/.test(text) ? `+${text}` : text;
 }
 
-export const when = (text) =>
-  text ? new Date(text).toLocaleString(region(), { dateStyle: "medium", timeStyle: "short" }) : "–";
+export const when = (text, dateStyle = "medium") =>
+  text ? new Date(text).toLocaleString(region(), { dateStyle, timeStyle: "short" }) : "–";
 
 export const bytes = (n) => {
   const steps = [["B", 1], ["kB", 1e3], ["MB", 1e6], ["GB", 1e9]];

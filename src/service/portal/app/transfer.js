@@ -124,8 +124,9 @@ class Transfer {
 
 // A scan that a job holds already: checked and reconstructed again without being sent.
 export class Held {
-  constructor(id, plan) {
-    Object.assign(this, { number: `held-${id}`, id, plan, priority: 0, job: null });
+  // known: the code of the fault that the reader has seen already.
+  constructor(id, plan, known) {
+    Object.assign(this, { number: `held-${id}`, id, plan, known, priority: 0, job: null });
   }
 
   change() {}
