@@ -327,6 +327,26 @@ async function mendFailed() {
   await shot("failed");
 }
 
+// Plain images say what they lack, and are understood once it is given.
+async function plainImages(truth) {
+  await open("#/send", "#drop");
+  const pictures = readdirSync(join(scan, "png")).filter((name) => name.endsWith(".png"));
+  refusals = [422];
+  await page.setInputFiles("#files", pictures.map((name) => join(scan, "png", name)));
+  await page.getByText("input.geometry_missing").waitFor({ timeout: LONG });
+  assert.equal(await page.getByRole("button", { name: "Reconstruct" }).count(), 0, "nothing to reconstruct yet");
+  await accessible("images without geometry");
+  refusals = [];
+  for (const [label, k] of [["Row step", 0], ["Column step", 1], ["Slice spacing", 2]]) {
+    await page.getByLabel(label).fill(String(truth.input.spacing_mm[k]));
+  }
+  await page.locator("details form").getByRole("button", { name: "Check again" }).click();
+  await page.locator(".check-picture .contour").first().waitFor({ timeout: LONG, state: "attached" });
+  await page.getByText("plain images").waitFor();
+  await page.getByRole("button", { name: "Remove" }).first().click();
+  await until("an erased upload", async () => (await page.locator(".scan").count()) === 0);
+}
+
 async function cohort() {
   await open("#/cohort", ".cohort-plots .point");
   await until("two results", async () => (await page.locator(".cohort-plots .point").count()) === 2);
@@ -403,6 +423,7 @@ try {
   await download(id);
   await queue();
   await mendFailed();
+  await plainImages(truth);
   await cohort();
   await framed(id);
   await german();

@@ -28,10 +28,13 @@ async function look(panel) {
   const { transfer, found, signal } = panel;
   if (transfer.job) return done(panel);
   found.replaceChildren(h("p", { class: "busy", role: "status" }, t("check.reading")));
-  let answer = null;
+  const asked = JSON.stringify(transfer.plan);
+  // Who comes back to this view sees the answer of before.
+  let answer = transfer.checked?.plan === asked ? transfer.checked.answer : null;
   try {
-    answer = await transfer.submit({ validate: true, signal });
+    answer ??= await transfer.submit({ validate: true, signal });
     transfer.understood = answer.understood;
+    transfer.checked = { plan: asked, answer };
   } catch (error) {
     if (!(error instanceof Fault)) return;
     transfer.understood = null;

@@ -16,6 +16,8 @@ import { onTransfers } from "./transfer.js";
 
 const VIEWS = { jobs: showQueue, job: showJob, send: showSend, compare: showCompare, cohort: showCohort, admin: showAdmin };
 const NAV = ["send", "jobs", "compare", "cohort", "admin"];
+// What a role finds: the service refuses the rest anyway.
+const MAY = { read: ["jobs", "compare", "cohort"], upload: ["send", "jobs", "compare", "cohort"], auditor: ["admin"] };
 const SIGNS = { auto: "◐", light: "☀", dark: "☾" };
 const go = () => route(VIEWS);
 
@@ -44,7 +46,7 @@ function drawHeader() {
     h("div", { class: "tools" }, language, theme, out));
   whoami().then((who) => {
     out.hidden = !who.keys;
-    document.querySelector('nav a[data-view="admin"]').hidden = who.role !== "admin" && who.role !== "auditor";
+    for (const link of links) link.hidden = !(MAY[who.role] ?? NAV).includes(link.dataset.view);
   }).catch(() => {});
 }
 
@@ -63,8 +65,9 @@ applyTheme();
 await loadTexts();
 if (embedded) startEmbedded();
 else {
-  await startSession();
+  const who = await startSession();
   drawHeader();
+  if (who.role === "auditor" && !location.hash) history.replaceState(null, "", "#/admin");
 }
 document.getElementById("foot").textContent = t("foot.research");
 window.addEventListener("hashchange", go);

@@ -18,8 +18,6 @@ export async function whoami() {
   return known;
 }
 
-export const may = (role) => role === "admin";
-
 function ask() {
   asking ??= new Promise((resolve) => {
     const key = h("input", { id: "key", name: "key", type: "password", autocomplete: "off", required: true, placeholder: "vsk_…", "aria-describedby": "key-fault" });
