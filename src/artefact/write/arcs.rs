@@ -4,10 +4,12 @@
 use super::render::Camera;
 use super::style::{ANGLE_RGB, hex};
 use crate::Reconstruction;
-use morphometry::{Branch, Junction};
+use morphometry::{Angle, Junction};
 use space::{P3, V3};
 use std::fmt::Write as _;
 
+/// Names of the roles that angles speak of.
+const ROLES: [&str; 5] = ["graft", "proximal", "distal", "host_a", "host_b"];
 /// Angles that are drawn: the three of the paper come first.
 const DRAWN: usize = 3;
 /// Radius of the first arc and what each further one adds, diameters of the graft.
@@ -29,48 +31,102 @@ pub(super) struct Arc {
     radius_mm: f64,
 }
 
-/// The first measured angles of a junction.
+/// The first measured angles of a junction that can be drawn.
 pub(super) fn arcs(r: &Reconstruction<'_>, j: &Junction) -> Vec<Arc> {
-    let branches: Vec<&Branch> = r.morphometry.branches.iter().filter(|b| j.branches.contains(&b.id)).collect();
-    let graft = branches.iter().find(|b| b.role == morphometry::Role::Graft).or(branches.first());
+    let legs = legs(r, j);
+    let known = parties_of(j, &legs);
+    let graft = r.morphometry.branches.iter().find(|b| j.branches.contains(&b.id) && b.diameter_mm.is_some());
     let diameter = graft.and_then(|b| b.diameter_mm).unwrap_or(5.0);
     let measured = j.angles.iter().enumerate().filter_map(|(i, a)| Some((i, a, a.value_deg?)));
-    measured
-        .take(DRAWN)
-        .filter_map(|(index, a, value_deg)| {
-            let (from, to) = directions(&a.name, &branches, j.plane_normal, value_deg)?;
-            let radius_mm = diameter * (RADIUS[0] + RADIUS[1] * index as f64);
-            Some(Arc { index, value_deg, vertex: j.axes_point.unwrap_or(j.medial_point), from, to, radius_mm })
+    let arc = |(index, a, value_deg): (usize, &Angle, f64)| {
+        let (from, to) = between(&a.name, &known, j.plane_normal)?;
+        let fits = (from.angle_to(to).to_degrees() - value_deg).abs() < MISS;
+        let radius_mm = diameter * (RADIUS[0] + RADIUS[1] * index as f64);
+        let vertex = j.axes_point.unwrap_or(j.medial_point);
+        fits.then_some(Arc { index, value_deg, vertex, from, to, radius_mm })
+    };
+    measured.take(DRAWN).filter_map(arc).collect()
+}
+
+/// A branch that meets the junction: the names it may go by, and its unit direction away from the junction.
+struct Leg {
+    names: [String; 2],
+    direction: V3,
+}
+
+fn legs(r: &Reconstruction<'_>, j: &Junction) -> Vec<Leg> {
+    let meeting = r.morphometry.branches.iter().filter(|b| j.branches.contains(&b.id));
+    meeting
+        .filter_map(|b| {
+            // a branch has the direction of its first junction
+            let sign = if b.from_node == j.node { 1.0 } else { -1.0 };
+            let names = [b.role.name().to_owned(), format!("branch_{}", b.id)];
+            Some(Leg { names, direction: b.direction? * sign })
         })
         .collect()
 }
 
-/// The two directions that an angle's name speaks of, with the signs under which they enclose its value: a branch between
-/// two junctions has one direction, and a normal two sides.
-fn directions(name: &str, branches: &[&Branch], normal: Option<V3>, value_deg: f64) -> Option<(V3, V3)> {
-    let (first, rest) = leading(name, branches)?;
-    let second = leading(rest, branches);
-    let (from, to) = match second {
-        Some((b, "")) => (first.direction?, b.direction?),
-        Some((b, "planar")) => {
-            let (d, n) = (b.direction?, normal?);
-            (first.direction?, (d - n * d.dot(n)).normalised()?)
-        }
-        _ if rest == "normal" => (first.direction?, normal?),
-        _ => return None,
+/// The direction of each party that the angles speak of. A branch carries the role of its first junction: where that is
+/// another one, the three legs are told apart by the angles between them.
+fn parties_of<'n>(j: &'n Junction, legs: &[Leg]) -> Vec<(&'n str, V3)> {
+    let mut names: Vec<&str> = j.angles.iter().flat_map(|a| split(&a.name).0).collect();
+    names.sort_unstable();
+    names.dedup();
+    let named = |name: &&'n str| {
+        let leg = legs.iter().find(|l| l.names.iter().any(|n| n == name))?;
+        Some((*name, leg.direction))
     };
-    let signs = [(1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)];
-    let all = signs.map(|(a, b)| (from * a, to * b));
-    all.into_iter().find(|(a, b)| (a.angle_to(*b).to_degrees() - value_deg).abs() < MISS)
+    let direct: Vec<_> = names.iter().filter_map(named).collect();
+    let ([a, b, c], [x, y, z], true) = (&names[..], legs, direct.len() < names.len()) else { return direct };
+    let orders = [[x, y, z], [x, z, y], [y, x, z], [y, z, x], [z, x, y], [z, y, x]];
+    let assigned = orders.map(|o| vec![(*a, o[0].direction), (*b, o[1].direction), (*c, o[2].direction)]);
+    let miss = |known: &Vec<(&str, V3)>| -> f64 {
+        let plain = j.angles.iter().filter(|a| split(&a.name).1.is_empty());
+        let apart = |a: &Angle| {
+            let (from, to) = between(&a.name, known, None)?;
+            Some((from.angle_to(to).to_degrees() - a.value_deg?).abs())
+        };
+        plain.filter_map(apart).sum()
+    };
+    assigned.into_iter().min_by(|a, b| miss(a).total_cmp(&miss(b))).unwrap_or(direct)
 }
 
-/// The branch that a name begins with, and the rest of the name.
-fn leading<'a, 'n>(name: &'n str, branches: &[&'a Branch]) -> Option<(&'a Branch, &'n str)> {
-    branches.iter().find_map(|&b| {
-        let numbered = format!("branch_{}", b.id);
-        let rest = name.strip_prefix(b.role.name()).or_else(|| name.strip_prefix(&numbered))?;
-        (rest.is_empty() || rest.starts_with('_')).then(|| (b, rest.trim_start_matches('_')))
-    })
+/// The parties that an angle's name speaks of, and what stands behind them: `planar`, `normal` or nothing.
+fn split(name: &str) -> (Vec<&str>, &str) {
+    let (mut parties, mut rest) = (Vec::new(), name);
+    while let Some(length) = leading(rest) {
+        parties.push(&rest[..length]);
+        rest = rest[length..].trim_start_matches('_');
+    }
+    (parties, rest)
+}
+
+/// Length of the role or `branch_N` that a name begins with.
+fn leading(name: &str) -> Option<usize> {
+    let numbered = name.strip_prefix("branch_").map(|rest| {
+        let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
+        "branch_".len() + digits
+    });
+    let role = ROLES.iter().find(|r| name.starts_with(**r)).map(|r| r.len());
+    let length = role.or(numbered)?;
+    matches!(name.as_bytes().get(length), None | Some(b'_')).then_some(length)
+}
+
+/// The two directions of an angle.
+fn between(name: &str, known: &[(&str, V3)], normal: Option<V3>) -> Option<(V3, V3)> {
+    let (parties, rest) = split(name);
+    let direction = |i: usize| known.iter().find(|(n, _)| Some(n) == parties.get(i)).map(|(_, d)| *d);
+    let from = direction(0)?;
+    let to = match rest {
+        "normal" => normal?,
+        "planar" => {
+            let (d, n) = (direction(1)?, normal?);
+            (d - n * d.dot(n)).normalised()?
+        }
+        "" => direction(1)?,
+        _ => return None,
+    };
+    Some((from, to))
 }
 
 impl Arc {
@@ -133,14 +189,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_lead_to_the_branches_that_they_speak_of() {
-        let f = Fixture::new();
-        let r = f.reconstruction();
-        let all: Vec<&Branch> = r.morphometry.branches.iter().collect();
-        let (b, rest) = leading("graft_distal_planar", &all).unwrap();
-        assert_eq!((b.role.name(), rest), ("graft", "distal_planar"));
-        assert_eq!(leading("distal_normal", &all).unwrap().1, "normal");
-        assert!(leading("grafting", &all).is_none() && leading("branch_77_x", &all).is_none());
+    fn names_are_split_into_the_parties_that_they_speak_of() {
+        assert_eq!(split("graft_distal_planar"), (vec!["graft", "distal"], "planar"));
+        assert_eq!(split("host_b_normal"), (vec!["host_b"], "normal"));
+        assert_eq!(split("branch_3_branch_12"), (vec!["branch_3", "branch_12"], ""));
+        assert_eq!(split("grafting"), (vec![], "grafting"));
     }
 
     #[test]
@@ -155,7 +208,20 @@ mod tests {
             let views = cameras(&r, [824, 470]);
             assert!(views.iter().any(|c| arc.is_for(c, &views)));
         }
-        let wrong = directions("graft_proximal", &r.morphometry.branches.iter().collect::<Vec<_>>(), None, 10.0);
-        assert!(wrong.is_none());
+        let mut wrong = j.clone();
+        wrong.angles.iter_mut().for_each(|a| a.value_deg = a.value_deg.map(|v| v + 20.0));
+        assert!(arcs(&r, &wrong).is_empty());
+    }
+
+    #[test]
+    fn legs_without_the_roles_of_this_junction_are_told_apart_by_their_angles() {
+        let f = Fixture::new();
+        let r = f.reconstruction();
+        let j = r.main_junction().unwrap();
+        let mut nameless = legs(&r, j);
+        let wanted = parties_of(j, &nameless);
+        nameless.iter_mut().for_each(|l| l.names = ["other".to_owned(), "other".to_owned()]);
+        nameless.reverse();
+        assert_eq!(parties_of(j, &nameless), wanted);
     }
 }

@@ -6,7 +6,7 @@ import { plot } from "./plot.js";
 import { mainJunction } from "./result.js";
 import { setQuery } from "./router.js";
 import { pane, viewButtons } from "./scene.js";
-import { angleName, number, roleName, signed, t, when } from "./text.js";
+import { angleName, countRoles, number, roleName, signed, t, when } from "./text.js";
 
 export async function showCompare(box, { query, signal }) {
   const list = (await json("/v1/jobs?state=succeeded&limit=200", { signal })).items;
@@ -33,6 +33,7 @@ async function both(body, { a, b }, signal) {
   body.replaceChildren(h("p", { class: "busy", role: "status" }, t("result.reading")));
   const [first, second] = await Promise.all([a, b].map((id) => lasting(filePath(id, "result.json"))));
   if (signal.aborted) return;
+  countRoles(first);
   const three = pane(t("compare.overlay"), [{ id: a, kind: "side-a" }, { id: b, kind: "side-b" }], { found: first, junction: mainJunction(first), signal });
   three.tools.append(viewButtons(three.viewer), h("span", { class: "key side-a" }, t("compare.a")), h("span", { class: "key side-b" }, t("compare.b")));
   body.replaceChildren(...[

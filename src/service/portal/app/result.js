@@ -9,7 +9,7 @@ import { files } from "./files.js";
 import { branchCard, qualityCard } from "./quality.js";
 import { rolesPanel } from "./roles.js";
 import { picture, Slices } from "./slices.js";
-import { place, t } from "./text.js";
+import { countRoles, place, t } from "./text.js";
 import { scene } from "./scene.js";
 
 export function warnings(list) {
@@ -41,6 +41,7 @@ export async function showResult(box, job, { signal }) {
   box.append(shell);
   const [found, list] = await Promise.all([lasting(filePath(job.id, "result.json")), json(`${jobPath(job.id)}/artefacts`, { signal })]);
   if (signal.aborted) return;
+  countRoles(found);
   const focus = new Focus();
   const junctions = found.junctions ?? [];
   const shown = { junction: mainJunction(found) };

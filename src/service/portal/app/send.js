@@ -79,7 +79,7 @@ function scanCard(transfer, signal) {
   const checked = h("div");
   const buttons = h("div", { class: "actions" });
   const title = transfer.files.length === 1 ? transfer.files[0].name : t("count.files", { n: transfer.files.length });
-  const element = h("section", { class: "card scan", "aria-label": title },
+  const element = h("section", { class: "card scan", "aria-label": `${title} (${transfer.number})` },
     h("div", { class: "scan-head" }, h("h2", {}, title), buttons), bar, trouble, checked);
   let begun = false;
   const update = () => {

@@ -66,8 +66,17 @@ export function duration(seconds) {
 
 const ROLES = ["graft", "proximal", "distal", "host_a", "host_b", "other"];
 
-export const roleName = (branch) =>
-  ROLES.includes(branch.role) && branch.role !== "other" ? t(`role.${branch.role}`) : t("role.branch", { id: branch.id });
+// A role's name; with the branch's number where others of the same result have that role (see `countRoles`).
+export function roleName(branch) {
+  if (!ROLES.includes(branch.role) || branch.role === "other") return t("role.branch", { id: branch.id });
+  return branch.twins > 1 ? `${t(`role.${branch.role}`)} (${branch.id})` : t(`role.${branch.role}`);
+}
+
+// Notes in every branch how many have its role: a tree has a graft at each junction.
+export function countRoles(found) {
+  for (const branch of found.branches) branch.twins = found.branches.filter((b) => b.role === branch.role).length;
+  return found;
+}
 
 // An angle's name in words; unknown names are put together from the branches in them.
 export function angleName(name) {
