@@ -343,7 +343,7 @@ async function plainImages(truth) {
   }
   await page.locator("details form").getByRole("button", { name: "Check again" }).click();
   await page.locator(".check-picture .contour").first().waitFor({ timeout: LONG, state: "attached" });
-  await page.getByText("plain images").waitFor();
+  await page.getByText("plain images", { exact: true }).waitFor();
   await page.getByRole("button", { name: "Remove" }).first().click();
   await until("an erased upload", async () => (await page.locator(".scan").count()) === scans);
 }
