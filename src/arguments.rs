@@ -83,6 +83,9 @@ pub(crate) struct Serve {
     /// A host to which webhooks may go though its network is not public; may be given several times.
     #[arg(long = "webhook-host")]
     pub(crate) webhook_hosts: Vec<String>,
+    /// An origin (https://host) whose pages may show a result in a frame; may be given several times.
+    #[arg(long = "frame-ancestor", value_parser = origin)]
+    pub(crate) frame_ancestors: Vec<String>,
     /// No API keys: only on a loopback address.
     #[arg(long)]
     pub(crate) no_auth: bool,
@@ -314,4 +317,14 @@ pub(crate) struct Demo {
     /// Keep the service running afterwards (the default when a person is at the terminal).
     #[arg(long)]
     pub(crate) keep: bool,
+}
+
+/// An origin as a browser writes it, and nothing that could say more in a header.
+fn origin(text: &str) -> Result<String, String> {
+    let host = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://")).unwrap_or_default();
+    let plain = host.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.:[]*".contains(&b));
+    if host.is_empty() || !plain {
+        return Err("give an origin such as https://portal.example.org".to_owned());
+    }
+    Ok(text.to_owned())
 }

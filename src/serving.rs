@@ -2,6 +2,8 @@
 
 use crate::arguments::{Backup, Data, Key, KeyAction, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
+use artefact::write;
+use serde_json::Value;
 use service::auth::{Role, keys, keys::NewKey};
 use service::{Auth, Config, Problem, audit};
 use std::process::ExitCode;
@@ -107,6 +109,7 @@ fn data_config(a: Data) -> Config {
             .collect(),
         intake,
         check_plan,
+        check_scan,
         ..Config::default()
     }
 }
@@ -119,6 +122,7 @@ fn config(a: Serve) -> Config {
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
+        frame_ancestors: a.frame_ancestors,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         ..data_config(a.data)
     }
@@ -138,6 +142,29 @@ fn check_plan(bytes: &[u8]) -> Result<(), Problem> {
             Err(Problem::from_fault(&faults).with_errors(faults.faults.iter().map(each).collect()))
         }
     }
+}
+
+/// Most pixels of a scan that is read for a check, which happens beside the service's other work (1 GiB).
+const MOST_CHECKED: u64 = 256 << 20;
+
+/// What would be understood of a scan, with its slices as a picture in the answer itself.
+fn check_scan(files: Vec<(String, Vec<u8>)>, plan: &str) -> Result<Value, Problem> {
+    let files = files.into_iter().map(|(name, bytes)| NamedBytes { name, bytes }).collect();
+    let plan = artefact::plan::Plan::parse(plan.as_bytes()).map_err(|e| Problem::from_fault(&e))?;
+    let limits = Limits { pixels: MOST_CHECKED, ..Limits::default() };
+    let ctx = exec::Ctx::new(1).map_err(Problem::internal)?;
+    let read = pipeline::understand(files, &plan, &limits, &ctx).map_err(|e| Problem::from_fault(&e))?;
+    let mut told = read.facts;
+    if let Some(refusal) = &read.refusal {
+        told["refusal"] = serde_json::to_value(Problem::from_fault(refusal)).map_err(Problem::internal)?;
+    }
+    let atlas = write::stack_atlas(&read.stack, read.contours.as_ref()).map_err(|e| Problem::from_fault(&e))?;
+    if let Some(atlas) = atlas {
+        let text = atlas.json().map_err(|e| Problem::from_fault(&e))?;
+        told["slices"] = serde_json::from_slice(&text).map_err(Problem::internal)?;
+        told["slices"]["image"] = format!("data:image/jpeg;base64,{}", service::media::base64(&atlas.jpeg)).into();
+    }
+    Ok(told)
 }
 
 fn with_runtime(work: impl Future<Output = anyhow::Result<()>>) -> ExitCode {

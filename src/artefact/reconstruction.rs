@@ -36,6 +36,8 @@ pub struct Reconstruction<'a> {
     pub pictures: Vec<SlicePicture>,
     /// What was changed, where this is a re-synthesis and no scan.
     pub variant: Option<Variant>,
+    /// All grey planes for viewers, where there are any.
+    pub atlas: Option<crate::write::Atlas>,
 }
 
 impl Reconstruction<'_> {

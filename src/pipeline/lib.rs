@@ -9,5 +9,5 @@ mod source;
 mod step;
 
 pub use failure::Failure;
-pub use reconstruct::{Understood, input, run, validate};
+pub use reconstruct::{Understood, input, run, understand, validate};
 pub use step::{Event, Observer};

@@ -89,6 +89,7 @@ fn reconstruct(
             morphometry: &morphometry,
             warnings: &warnings,
             pictures: source.pictures,
+            atlas: source.atlas,
             variant: plan.variant.clone(),
         };
         let mut files = write::write_all(&reconstruction)?;
@@ -388,6 +389,8 @@ pub struct Understood {
     pub stack: Stack,
     /// The label mask that came with it.
     pub mask: Option<imaging::Mask>,
+    /// The contours, where they were looked for and found.
+    pub contours: Option<Contours>,
 }
 
 /// What is understood of a scan and a plan, without a reconstruction: slices, spacing, orientation, lumens found. A scan
@@ -398,9 +401,34 @@ pub struct Understood {
 pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood, Failure> {
     refuse_unmade(plan)?;
     let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
+    Ok(segmented(stack, input, plan, ctx))
+}
+
+fn segmented(stack: Stack, input: InputReport, plan: &Plan, ctx: &Ctx) -> Understood {
     let outcome = imaging::contours(&stack, &input.imaging(plan), ctx);
     let facts = understood(&stack, &input, outcome.as_ref().ok());
-    Ok(Understood { facts, refusal: outcome.err().map(|e| Failure::of(&e)), stack, mask: input.mask })
+    let (contours, refusal) = match outcome {
+        Ok((contours, _)) => (Some(contours), None),
+        Err(e) => (None, Some(Failure::of(&e))),
+    };
+    Understood { facts, refusal, stack, mask: input.mask, contours }
+}
+
+/// Most pixels of a scan whose contours are looked for before it is sent: some seconds on one thread.
+const MOST_SEGMENTED: usize = 24 << 20;
+
+/// As [`validate`], for files in memory; a scan of more than [`MOST_SEGMENTED`] pixels is only read.
+///
+/// # Errors
+/// [`Failure`] of the plan or of reading.
+pub fn understand(files: Vec<NamedBytes>, plan: &Plan, limits: &Limits, ctx: &Ctx) -> Result<Understood, Failure> {
+    refuse_unmade(plan)?;
+    let (stack, input) = artefact::read::stack_of(files, plan, limits).map_err(|e| Failure::of(&e))?;
+    if stack.pixels.len() > MOST_SEGMENTED {
+        let facts = understood(&stack, &input, None);
+        return Ok(Understood { facts, refusal: None, stack, mask: input.mask, contours: None });
+    }
+    Ok(segmented(stack, input, plan, ctx))
 }
 
 /// As [`validate`], but nothing is segmented: the input alone, for comparison with other programs' readers.
@@ -409,7 +437,7 @@ pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood
 /// [`Failure`] of reading.
 pub fn input(inputs: &[PathBuf], plan: &Plan) -> Result<Understood, Failure> {
     let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
-    Ok(Understood { facts: understood(&stack, &input, None), refusal: None, stack, mask: input.mask })
+    Ok(Understood { facts: understood(&stack, &input, None), refusal: None, stack, mask: input.mask, contours: None })
 }
 
 fn understood(stack: &Stack, input: &InputReport, found: Option<&(Contours, imaging::Report)>) -> Value {

@@ -23,6 +23,8 @@ pub(crate) struct Source {
     pub(crate) segmentation: SegmentationFacts,
     pub(crate) warnings: Vec<Warning>,
     pub(crate) pictures: Vec<SlicePicture>,
+    /// All grey planes for viewers; a variant has none.
+    pub(crate) atlas: Option<write::Atlas>,
     /// Draws for the bands: none where there is no noise to draw from.
     pub(crate) draws: usize,
 }
@@ -37,6 +39,7 @@ pub(crate) fn scanned(inputs: &[PathBuf], plan: &Plan, steps: &mut Steps<'_>) ->
         segmentation: facts::segmentation(&contours, &report),
         warnings: told(&input, Some(&report)).cloned().collect(),
         pictures: write::slice_pictures(&stack, &contours).map_err(|e| Failure::of(&e))?,
+        atlas: write::contour_atlas(&stack, &contours).map_err(|e| Failure::of(&e))?,
         contours,
         draws: DRAWS,
     })
@@ -67,6 +70,7 @@ pub(crate) fn changed(
         segmentation: facts::rings(&made.contours),
         warnings: vec![unmeasured()],
         pictures: Vec::new(),
+        atlas: None,
         contours: made.contours,
         draws: 0,
     })

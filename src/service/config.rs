@@ -15,6 +15,9 @@ pub type Intake = fn(Vec<NamedBytes>) -> Result<Vec<NamedBytes>, Problem>;
 /// Checks the bytes of a plan; every fault at once.
 pub type CheckPlan = fn(&[u8]) -> Result<(), Problem>;
 
+/// Tells what a scan and its plan would be understood as, without a reconstruction. Runs on a blocking thread.
+pub type CheckScan = fn(Vec<NamedBytes>, &str) -> Result<serde_json::Value, Problem>;
+
 /// Who may call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Auth {
@@ -59,6 +62,8 @@ pub struct Config {
     pub sweep_seconds: u64,
     /// Hosts to which webhooks may go though they lie in a network that is not public, by plain http too. Default none.
     pub webhook_hosts: Vec<String>,
+    /// Origins whose pages may show a result's view in a frame, such as `https://portal.example.org`. Default none.
+    pub frame_ancestors: Vec<String>,
     /// Largest request body, bytes. Default 2 GiB.
     pub max_body: u64,
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
@@ -70,6 +75,8 @@ pub struct Config {
     pub intake: Intake,
     /// Checks a plan. Default: any JSON object; the binary wires the artefact crate's reader.
     pub check_plan: CheckPlan,
+    /// Reads a scan for `?validate=true`. Default: null; the binary wires the pipeline's reader.
+    pub check_scan: CheckScan,
 }
 
 impl Default for Config {
@@ -85,6 +92,7 @@ impl Default for Config {
             job_seconds: 6 * 3600,
             sweep_seconds: 3600,
             webhook_hosts: Vec::new(),
+            frame_ancestors: Vec::new(),
             workers: 1,
             threads: 0,
             auth: Auth::Required,
@@ -95,6 +103,7 @@ impl Default for Config {
             min_free_disk: 256 << 20,
             intake: Ok,
             check_plan: crate::intake::json_object,
+            check_scan: |_, _| Ok(serde_json::Value::Null),
         }
     }
 }

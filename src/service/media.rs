@@ -105,6 +105,7 @@ pub fn media_type(name: &str) -> &'static str {
         "zip" => "application/zip",
         "xml" => "application/xml",
         "png" => "image/png",
+        "jpg" => "image/jpeg",
         _ => "application/octet-stream",
     }
 }

@@ -3,6 +3,7 @@
 use crate::audit::{self, Entry};
 use crate::auth::Principal;
 use crate::config::Config;
+use crate::db::{Scope, args};
 use crate::error::Problem;
 use crate::queue::Queue;
 use crate::store::Store;
@@ -38,19 +39,40 @@ pub struct State {
 }
 
 impl State {
+    /// Writes into the audit that `who` sent a job, and into the job who that was; gives back the name.
+    ///
+    /// # Errors
+    /// The database's.
+    pub async fn audit_sent(&self, who: &Principal, trace: &str, job: &str) -> Result<Option<String>, Problem> {
+        let (line, id) = (entry(who, trace, "job.create", job), job.to_owned());
+        let name = "UPDATE job SET sent_by = COALESCE((SELECT label FROM api_key WHERE id = $2), $2) WHERE id = $1 \
+                    RETURNING sent_by";
+        let named = self.queue.db().write(Scope::System, move |tx| {
+            Box::pin(async move {
+                let row = tx.row(name, args![&id, &line.actor]).await?;
+                audit::append(tx, &line).await?;
+                row.map(|row| row.get("sent_by")).transpose()
+            })
+        });
+        Ok(named.await?)
+    }
+
     /// Writes who did what into the audit; without the line, the caller must not go on.
     ///
     /// # Errors
     /// The database's.
     pub async fn audit(&self, who: &Principal, trace: &str, action: &str, object: &str) -> Result<(), Problem> {
-        let entry = Entry {
-            tenant: who.tenant.clone(),
-            actor: who.actor.clone(),
-            action: action.to_owned(),
-            object: object.to_owned(),
-            outcome: "ok".to_owned(),
-            trace_id: trace.to_owned(),
-        };
-        Ok(audit::write(self.queue.db(), entry).await?)
+        Ok(audit::write(self.queue.db(), entry(who, trace, action, object)).await?)
+    }
+}
+
+fn entry(who: &Principal, trace: &str, action: &str, object: &str) -> Entry {
+    Entry {
+        tenant: who.tenant.clone(),
+        actor: who.actor.clone(),
+        action: action.to_owned(),
+        object: object.to_owned(),
+        outcome: "ok".to_owned(),
+        trace_id: trace.to_owned(),
     }
 }

@@ -32,7 +32,8 @@ const PYTHON_PACKAGES: &[&str] = &[
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
-const NODE_PACKAGES: &[&str] = &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1", "tus-js-client@4.3.1"];
+const NODE_PACKAGES: &[&str] =
+    &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1", "tus-js-client@4.3.1", "axe-core@4.14.1"];
 
 /// Build the release binary (with the portal) and give its path.
 pub(crate) fn release_binary() -> Result<PathBuf> {
@@ -70,7 +71,7 @@ pub(crate) fn compiler() -> Result<()> {
     apt("a C compiler (SQLite is compiled from source)", &["build-essential"])
 }
 
-/// The portal's 3D view is bundled by npm. Without it everything else works, so that a failure here is only said.
+/// The portal is bundled by npm. Without its 3D view everything else works, so that a failure here is only said.
 pub(crate) fn node() -> Result<()> {
     if shell::has("npm") {
         return Ok(());

@@ -321,6 +321,7 @@ impl Fixture {
             warnings: &self.warnings,
             pictures: (0..3).map(slice_picture).collect(),
             variant: None,
+            atlas: None,
         }
     }
 }

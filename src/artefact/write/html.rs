@@ -34,6 +34,7 @@ const CROP_ROOM: f64 = 1.7;
 #[template(path = "report.html")]
 struct Page {
     digest: String,
+    version: &'static str,
     warnings: Vec<String>,
     more_warnings: usize,
     views: Vec<View>,
@@ -86,6 +87,7 @@ pub fn report_html(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
         r.morphometry.junctions.iter().filter(|j| main.is_none_or(|m| !std::ptr::eq(*j, m))).collect();
     let page = Page {
         digest: r.input.digest.clone(),
+        version: env!("CARGO_PKG_VERSION"),
         more_warnings: warnings.len().saturating_sub(WARNINGS),
         warnings: warnings.into_iter().take(WARNINGS).collect(),
         views: views(r)?,
@@ -203,10 +205,10 @@ fn views(r: &Reconstruction<'_>) -> Result<Vec<View>, Error> {
     } else {
         ["From anterior", "From the side"]
     };
-    cameras(r, PICTURE)
-        .iter()
+    let all = cameras(r, PICTURE);
+    all.iter()
         .zip(titles)
-        .map(|(camera, title)| Ok(View { title: title.to_owned(), svg: view_svg(r, camera)? }))
+        .map(|(camera, title)| Ok(View { title: title.to_owned(), svg: view_svg(r, camera, &all)? }))
         .collect()
 }
 
@@ -228,8 +230,8 @@ fn warning_lines(r: &Reconstruction<'_>) -> Vec<String> {
         .collect()
 }
 
-/// A picture with names at the ends of the branches, a scale bar and the patient's directions.
-fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
+/// A picture with the names of the branches, the angles that it shows best, a scale bar and the patient's directions.
+fn view_svg(r: &Reconstruction<'_>, camera: &Camera, all: &[Camera]) -> Result<String, Error> {
     let [width, height] = camera.size;
     let png = base64(&picture(r, camera).png()?);
     let mut svg = format!(
@@ -238,6 +240,11 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera) -> Result<String, Error> {
     let mut taken = Vec::new();
     for b in r.morphometry.branches.iter().filter(|b| b.role != Role::Other) {
         branch_label(&mut svg, r, camera, b, &mut taken);
+    }
+    for arc in r.main_junction().map_or_else(Vec::new, |j| super::arcs::arcs(r, j)) {
+        if arc.is_for(camera, all) {
+            arc.draw(&mut svg, camera);
+        }
     }
     scale_bar(&mut svg, camera);
     directions(&mut svg, camera);
@@ -293,7 +300,7 @@ fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &B
     label(svg, [x, y], anchor, &hex(role_rgb(b.role)), words);
 }
 
-fn label(svg: &mut String, at: [f64; 2], anchor: &str, colour: &str, words: &str) {
+pub(super) fn label(svg: &mut String, at: [f64; 2], anchor: &str, colour: &str, words: &str) {
     // Writing into a String cannot fail.
     let _ = write!(
         svg,

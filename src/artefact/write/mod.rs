@@ -4,6 +4,8 @@
 //!
 //! Everything is made in memory before a byte is written, so that a fault in the last artefact leaves nothing behind.
 
+mod arcs;
+mod atlas;
 mod csv;
 pub mod dicom;
 mod error;
@@ -32,6 +34,7 @@ mod fixture;
 mod tests;
 
 pub use self::csv::angles_csv;
+pub use atlas::{Atlas, contour_atlas, stack_atlas};
 pub use error::Error;
 pub use geometry::{mesh_vtp, skeleton_vtp, surface_vtp};
 pub use glb::{gltf_position, surface_glb};
@@ -75,6 +78,10 @@ pub const SURFACE_EXTENDED_VTP: &str = "surface_extended.vtp";
 pub const CONTOURS_VTP: &str = "contours.vtp";
 /// The page to read and print.
 pub const REPORT_HTML: &str = "report.html";
+/// The grey planes as tiles of one picture.
+pub const SLICES_JPG: &str = "slices.jpg";
+/// Where its tiles lie, and the contours on them.
+pub const SLICES_JSON: &str = "slices.json";
 /// Thumbnail.
 pub const PREVIEW_PNG: &str = "preview.png";
 /// Times, host and version.
@@ -90,6 +97,7 @@ pub fn media_type(name: &str) -> &'static str {
         Some("csv") => "text/csv; charset=utf-8",
         Some("html") => "text/html; charset=utf-8",
         Some("png") => "image/png",
+        Some("jpg") => "image/jpeg",
         Some("glb") => "model/gltf-binary",
         Some("stl") => "model/stl",
         Some("vtp" | "vtu") => "application/vnd.vtk+xml",
@@ -117,7 +125,8 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
 }
 
 /// Every artefact but provenance.json, in this order: result.json, angles.csv, skeleton.json, skeleton.vtp, surface.vtp,
-/// surface.glb, surface.stl, contours.vtp, sections.json, report.html, preview.png.
+/// surface.glb, surface.stl, contours.vtp, sections.json, report.html, preview.png; slices.jpg and slices.json where there
+/// are planes to show.
 ///
 /// # Errors
 /// [`Error::NotFinite`] for a number that is not finite, with its path; [`Error::Mismatch`] for arrays that do not fit
@@ -125,7 +134,7 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
 pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
     let contours = geometry::contour_lines(r.contours)?;
     let make = |name, bytes: Result<Vec<u8>, Error>| Ok(NamedBytes::new(name, bytes?));
-    Ok(vec![
+    let mut files = vec![
         make(RESULT_JSON, result_json(r))?,
         make(ANGLES_CSV, angles_csv(r))?,
         make(SKELETON_JSON, skeleton_json(r))?,
@@ -137,5 +146,10 @@ pub fn write_all(r: &Reconstruction<'_>) -> Result<Vec<NamedBytes>, Error> {
         make(SECTIONS_JSON, sections_json(r))?,
         make(REPORT_HTML, report_html(r))?,
         make(PREVIEW_PNG, render::thumbnail(r, PREVIEW_SIZE))?,
-    ])
+    ];
+    if let Some(atlas) = &r.atlas {
+        files.push(NamedBytes::new(SLICES_JPG, atlas.jpeg.clone()));
+        files.push(make(SLICES_JSON, atlas.json())?);
+    }
+    Ok(files)
 }

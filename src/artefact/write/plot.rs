@@ -60,7 +60,8 @@ pub(crate) fn radius_along_branches(branches: &[Branch]) -> Result<Option<String
         .flat_map(|b| {
             [
                 curve(b, &|s| Some(s.radius_inscribed_mm), Stroke::Thin),
-                curve(b, &Section::radius_area_mm, Stroke::Solid),
+                // within the junction a section cuts more than one branch
+                curve(b, &|s| s.radius_area_mm().filter(|_| !s.in_junction), Stroke::Solid),
             ]
         })
         .collect();

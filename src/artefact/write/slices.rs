@@ -37,7 +37,7 @@ pub fn slice_pictures(stack: &Stack, contours: &Contours) -> Result<Vec<SlicePic
 }
 
 /// Smallest step of a lattice direction, not finer than [`LARGEST`] steps, and the number of even samples.
-fn even(offsets: &[f64]) -> (f64, usize) {
+pub(super) fn even(offsets: &[f64]) -> (f64, usize) {
     let extent = offsets.last().copied().unwrap_or(0.0);
     let step = offsets.windows(2).map(|w| w[1] - w[0]).filter(|s| *s > 0.0).fold(f64::INFINITY, f64::min);
     if !step.is_finite() || extent <= 0.0 {
@@ -45,6 +45,15 @@ fn even(offsets: &[f64]) -> (f64, usize) {
     }
     let step = step.max(extent / (LARGEST - 1) as f64);
     (step, (extent / step + 1e-6) as usize + 1)
+}
+
+/// The axis in a word.
+pub(super) fn axis_name(axis: Axis) -> &'static str {
+    match axis {
+        Axis::Slice => "slice",
+        Axis::Row => "row",
+        Axis::Column => "column",
+    }
 }
 
 /// `outlines` in the plane's (u, v), mm.
@@ -59,11 +68,7 @@ fn plane_picture(stack: &Stack, plane: &Plane, axis: Axis, outlines: Vec<Vec<[f6
     let at = |part: f64| sorted.get((part * (sorted.len() - 1) as f64) as usize).copied().unwrap_or(0.0);
     let (black, white) = (at(WINDOW[0]), at(WINDOW[1]));
     let scale = 255.0 / (white - black).max(f64::MIN_POSITIVE);
-    let name = match axis {
-        Axis::Slice => "slice",
-        Axis::Row => "row",
-        Axis::Column => "column",
-    };
+    let name = axis_name(axis);
     let n = plane.normal().to_array().map(f64::abs);
     let k = (0..3).fold(0, |best, k| if n[k] > n[best] { k } else { best });
     SlicePicture {
@@ -80,16 +85,17 @@ fn plane_picture(stack: &Stack, plane: &Plane, axis: Axis, outlines: Vec<Vec<[f6
 }
 
 /// The stack as a function of position: linear between samples, the nearest value outside.
-struct Grey<'a> {
+pub(super) struct Grey<'a> {
     stack: &'a Stack,
     offsets: Vec<f64>,
 }
 
 impl<'a> Grey<'a> {
-    fn new(stack: &'a Stack) -> Self {
+    pub(super) fn new(stack: &'a Stack) -> Self {
         Self { stack, offsets: (0..stack.slices()).map(|k| stack.offset_mm(k)).collect() }
     }
-    fn at(&self, p: P3) -> f64 {
+    /// The grey value at a point.
+    pub(super) fn at(&self, p: P3) -> f64 {
         let s = self.stack;
         if self.offsets.is_empty() || s.columns == 0 || s.rows == 0 {
             return 0.0;

@@ -5,6 +5,7 @@
 //! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
 
 pub mod keys;
+pub mod links;
 mod pace;
 
 use crate::config::Auth;
@@ -47,6 +48,8 @@ pub enum Action {
     Change,
     /// Read the audit.
     Audit,
+    /// Make and revoke keys, set what holds for the tenant.
+    Administer,
 }
 
 impl Role {
@@ -71,6 +74,7 @@ impl Role {
             Action::Read => self != Self::Auditor,
             Action::Change => matches!(self, Self::Upload | Self::Admin),
             Action::Audit => matches!(self, Self::Auditor | Self::Admin),
+            Action::Administer => self == Self::Admin,
         }
     }
 }
@@ -174,6 +178,11 @@ fn same_origin(headers: &HeaderMap) -> bool {
 pub struct Caller(Principal);
 
 impl Caller {
+    /// The principal, whatever its role: for calls that only say who it is.
+    pub fn known(self) -> Principal {
+        self.0
+    }
+
     /// The principal, if its role may do that.
     ///
     /// # Errors
@@ -210,8 +219,23 @@ impl FromRequestParts<State> for Caller {
                 "auth.origin",
                 "A page of another origin may not change anything here by cookie.",
             )),
+            Some(Sent::Bearer(token)) if token.starts_with(links::LINK_PREFIX) => {
+                links::caller(state.queue.db(), token, parts.uri.path(), safe).await
+            }
             Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
         }
+    }
+}
+
+/// A caller who may administer the tenant.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Administrator(pub Principal);
+
+impl FromRequestParts<State> for Administrator {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &State) -> Result<Self, Problem> {
+        Caller::from_request_parts(parts, state).await?.may(Action::Administer).map(Self)
     }
 }
 

@@ -9,10 +9,18 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
 /// Everything from this origin only, nothing inline.
-pub(super) const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; \
-    connect-src 'self' blob:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'";
+const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; \
+    connect-src 'self' blob:; base-uri 'none'; form-action 'self'; frame-ancestors";
 /// For answers that are not pages.
 const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'; sandbox";
+
+/// The policy of a page that these origins may show in a frame.
+pub(super) fn page_policy(frame_ancestors: &[String]) -> String {
+    match frame_ancestors {
+        [] => format!("{PAGE_POLICY} 'none'"),
+        some => format!("{PAGE_POLICY} {}", some.join(" ")),
+    }
+}
 
 /// Adds what a browser needs to know; a handler's own policy stands.
 pub(super) async fn headers(request: Request, next: Next) -> Response {

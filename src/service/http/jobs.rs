@@ -1,18 +1,17 @@
 //! Jobs: create, list, read, cancel, retry, erase.
 
-use super::multipart;
 use super::problems::TraceId;
 use super::range;
 use super::shapes::{Job, JobList};
+use super::taking;
 use crate::auth::Principal;
 use crate::error::Problem;
-use crate::intake::intake;
 use crate::queue::submit::LARGEST_PRIORITY;
 use crate::queue::{JobRow, JobState, NewJob, Page, Submitted};
 use crate::state::State;
 use crate::store::Store;
 use axum::Json;
-use axum::extract::{DefaultBodyLimit, Extension, FromRequest as _, Multipart, Path, Query, Request, State as Shared};
+use axum::extract::{DefaultBodyLimit, Extension, Path, Query, Request, State as Shared};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use serde::Deserialize;
@@ -92,6 +91,10 @@ struct Checked {
     valid: bool,
     /// What would be stored.
     input: super::shapes::InputShape,
+    /// What was understood: `input` (format, slices, rows, columns, spacing, corners), `segmentation` (null where it was
+    /// refused, with `refusal` saying why), `warnings`, and `slices` (as slices.json, its `image` a data URI).
+    #[schema(value_type = Option<Object>)]
+    understood: serde_json::Value,
 }
 
 /// A 200 of a sent scan.
@@ -111,11 +114,11 @@ enum Taken {
         ("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "The same key with the same input and plan gives the same job"),
         ("Prefer" = Option<String>, Header, description = "`wait=N`: answer when the job has ended, or after N seconds")
     ),
-    request_body(content((SubmitForm = "multipart/form-data"), (super::uploads::FromUpload = "application/json"))),
+    request_body(content((SubmitForm = "multipart/form-data"), (taking::Named = "application/json"))),
     responses(
         (status = 202, description = "Accepted", body = Job),
-        (status = 404, description = "No such upload", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The upload is not whole yet", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "No such upload or job", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The upload is not whole yet, or the job's scan is erased", body = Problem, content_type = "application/problem+json"),
         (status = 423, description = "A call is still sending to the upload", body = Problem, content_type = "application/problem+json"),
         (status = 200, description = "Ended within the wait, or the key was used before; with `validate`, what was read", body = Taken),
         (status = 400, description = "The upload is broken", body = Problem, content_type = "application/problem+json"),
@@ -138,29 +141,24 @@ async fn create(
     }
     let headers = request.headers().clone();
     let key = idempotency_key(&headers)?;
-    let (upload, resumable) = if names_upload(&headers) {
-        let (upload, id) = super::uploads::taken(&state, &who, request.into_body()).await?;
-        (upload, Some(id))
-    } else {
-        (multipart::read(&state, form(&state, &who, request).await?).await?, None)
-    };
-    let files = intake(&state.config, upload.files).await?;
+    let taking::Taken { plan, files, upload: resumable, budget } = taking::take(&state, &who, request).await?;
     let (input, files) =
         tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
     let id = Uuid::now_v7();
     let bytes: u64 = input.files.iter().map(|f| f.bytes).sum();
     if taking.validate == Some(true) {
-        let files = i64::try_from(input.files.len()).map_err(Problem::internal)?;
+        let count = i64::try_from(input.files.len()).map_err(Problem::internal)?;
         let bytes = i64::try_from(bytes).map_err(Problem::internal)?;
-        let input = super::shapes::InputShape { files, bytes, digest: input.digest };
-        return Ok(Json(Checked { valid: true, input }).into_response());
+        let input = super::shapes::InputShape { files: count, bytes, digest: input.digest };
+        let understood = taking::understood(&state, files, plan).await?;
+        return Ok(Json(Checked { valid: true, input, understood }).into_response());
     }
     let job = NewJob {
         id,
         tenant: who.tenant.clone(),
         priority,
         memory_mb: crate::worker::expected_mb(bytes),
-        plan: upload.plan,
+        plan,
         input_digest: input.digest.clone(),
         input_files: i64::try_from(input.files.len()).map_err(Problem::internal)?,
         input_bytes: i64::try_from(bytes).map_err(Problem::internal)?,
@@ -168,8 +166,8 @@ async fn create(
         idempotency_key: key,
     };
     let submitted = store_and_submit(&state, &job, &input, files).await;
-    drop(upload.budget);
-    let (row, replayed) = match submitted? {
+    drop(budget);
+    let (mut row, replayed) = match submitted? {
         Submitted::New(row) => (*row, false),
         Submitted::Replayed(row) => (*row, true),
         Submitted::Mismatch(row) => {
@@ -181,7 +179,7 @@ async fn create(
         }
     };
     if !replayed {
-        state.audit(&who, &trace.0, "job.create", &row.id).await?;
+        row.sent_by = state.audit_sent(&who, &trace.0, &row.id).await?;
     }
     if let Some(id) = resumable {
         crate::uploads::used(state.queue.db(), &who.tenant, id).await?;
@@ -189,36 +187,6 @@ async fn create(
     let waited = preferred_wait(&headers);
     let row = wait(&state, &who, row, waited, |row| row.state.is_final()).await?;
     Ok(accepted(row, waited, replayed))
-}
-
-/// Whether the body is JSON that names a resumable upload.
-fn names_upload(headers: &HeaderMap) -> bool {
-    let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
-    kind.split(';').next().is_some_and(|kind| kind.trim().eq_ignore_ascii_case("application/json"))
-}
-
-/// The multipart body; a Content-Length beyond the limit is refused before a byte is read.
-async fn form(state: &State, who: &Principal, request: Request) -> Result<Multipart, Problem> {
-    let length = request.headers().get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<u64>().ok());
-    // Boundaries and part headers come on top of the parts' bytes.
-    let most = who.max_bytes.unwrap_or(u64::MAX).min(state.config.max_body);
-    // A key with a bound of its own must say how much it sends: what is not counted beforehand would be read in vain.
-    if length.is_some_and(|n| n > most.saturating_add(1 << 20)) || (length.is_none() && who.max_bytes.is_some()) {
-        return Err(Problem::new(
-            StatusCode::PAYLOAD_TOO_LARGE,
-            "upload.too_large",
-            format!(
-                "The upload is larger than {most} bytes (or does not say its length), the most that this key may send."
-            ),
-        ));
-    }
-    Multipart::from_request(request, state).await.map_err(|_| {
-        Problem::new(
-            StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            "media_type",
-            "Send multipart/form-data with parts `input` (files or a zip) and, if wanted, `plan` (JSON).",
-        )
-    })
 }
 
 /// The input goes into the store first, so that a committed job never lacks it.

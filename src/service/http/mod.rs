@@ -1,19 +1,23 @@
 //! The network face: one router per resource, one layer that makes every error a problem, one place for headers.
 
+mod admin;
 mod artefacts;
 mod describe;
 mod events;
 mod guard;
 mod health;
 mod jobs;
+mod links;
 mod listen;
 mod multipart;
+mod order;
 mod portal;
 pub(crate) mod problems;
 mod range;
 mod session;
 mod shapes;
 mod stats;
+mod taking;
 mod uploads;
 mod webhooks;
 mod workers;
@@ -47,7 +51,8 @@ const SMALL_BODY: usize = 64 << 10;
         (name = "jobs", description = "Send a scan, follow it, end it"),
         (name = "results", description = "What a job made"),
         (name = "webhooks", description = "Be told when a job ends"),
-        (name = "monitoring", description = "Is it well, and how busy is it")
+        (name = "monitoring", description = "Is it well, and how busy is it"),
+        (name = "administration", description = "Keys and retention of a tenant")
     )
 )]
 struct Document;
@@ -67,12 +72,15 @@ impl utoipa::Modify for Keys {
 fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
+        .merge(order::router())
+        .merge(links::router())
         .merge(uploads::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
         .merge(workers::router())
         .merge(webhooks::router())
+        .merge(admin::router())
         .merge(session::router())
         .merge(health::router())
 }
@@ -89,7 +97,7 @@ pub(crate) fn router(state: State) -> Router {
     let (api, mut document) = documented().split_for_parts();
     describe::complete(&mut document);
     let document = Arc::new(document);
-    let page = portal::router().layer(CompressionLayer::new());
+    let page = portal::router(&state.config.frame_ancestors).layer(CompressionLayer::new());
     let described = Router::new()
         .route("/openapi.json", get(move || async move { axum::Json(Arc::clone(&document)) }))
         .layer(CompressionLayer::new());

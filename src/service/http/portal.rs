@@ -1,6 +1,6 @@
 //! The page, embedded in the binary: no file is read and nothing is fetched from elsewhere at run time.
 
-use super::guard::PAGE_POLICY;
+use super::guard::page_policy;
 use crate::state::State;
 use crate::store::digest;
 use axum::Router;
@@ -8,33 +8,39 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 
-/// The 3D view, bundled by build.rs (a small stand-in that says so when npm was missing then).
-const VIEW3D: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/view3d.js"));
+/// Name and bytes of each file of the page, from build.rs.
+const FILES: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/portal_files.rs"));
 
-const FILES: &[(&str, &str, &[u8])] = &[
-    ("/", "text/html; charset=utf-8", include_bytes!("../portal/index.html")),
-    ("/portal/app.js", "text/javascript; charset=utf-8", include_bytes!("../portal/app.js")),
-    ("/portal/api.js", "text/javascript; charset=utf-8", include_bytes!("../portal/api.js")),
-    ("/portal/job.js", "text/javascript; charset=utf-8", include_bytes!("../portal/job.js")),
-    ("/portal/plot.js", "text/javascript; charset=utf-8", include_bytes!("../portal/plot.js")),
-    ("/portal/view3d.js", "text/javascript; charset=utf-8", VIEW3D),
-    ("/portal/style.css", "text/css; charset=utf-8", include_bytes!("../portal/style.css")),
-    ("/portal/icon.svg", "image/svg+xml", include_bytes!("../portal/icon.svg")),
-];
-
-/// Routes of the page.
-pub(super) fn router() -> Router<State> {
-    FILES.iter().fold(Router::new(), |router, (path, media_type, bytes)| {
-        let tag = format!("\"{}\"", digest(bytes));
-        router.route(path, get(move |headers: HeaderMap| async move { file(&headers, media_type, bytes, &tag) }))
+/// Routes of the page: `/`, `/embed` (the same for a frame of `frame_ancestors`) and `/portal/NAME`.
+pub(super) fn router(frame_ancestors: &[String]) -> Router<State> {
+    let serve = |router: Router<State>, path: &str, (name, bytes): (&str, &'static [u8]), policy: String| {
+        let (tag, kind) = (format!("\"{}\"", digest(bytes)), media_type(name));
+        router.route(path, get(move |headers: HeaderMap| async move { file(&headers, kind, bytes, &tag, &policy) }))
+    };
+    FILES.iter().fold(Router::new(), |router, &(name, bytes)| {
+        if name != "index.html" {
+            return serve(router, &format!("/portal/{name}"), (name, bytes), page_policy(&[]));
+        }
+        let router = serve(router, "/", (name, bytes), page_policy(&[]));
+        serve(router, "/embed", (name, bytes), page_policy(frame_ancestors))
     })
 }
 
-fn file(headers: &HeaderMap, media_type: &'static str, bytes: &'static [u8], tag: &str) -> Response {
+fn media_type(name: &str) -> &'static str {
+    match name.rsplit('.').next() {
+        Some("html") => "text/html; charset=utf-8",
+        Some("js") => "text/javascript; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("json") => "application/json",
+        _ => "image/svg+xml",
+    }
+}
+
+fn file(headers: &HeaderMap, media_type: &'static str, bytes: &'static [u8], tag: &str, policy: &str) -> Response {
     let seen = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
     let common = [
         (header::CONTENT_TYPE, media_type),
-        (header::CONTENT_SECURITY_POLICY, PAGE_POLICY),
+        (header::CONTENT_SECURITY_POLICY, policy),
         (header::CACHE_CONTROL, "no-cache"),
         (header::ETAG, tag),
     ];

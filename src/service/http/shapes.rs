@@ -22,6 +22,8 @@ pub(super) struct Links {
     pub cancel: String,
     /// POST here to run a failed job again.
     pub retry: String,
+    /// Its plan.
+    pub plan: String,
 }
 
 /// What was sent.
@@ -48,6 +50,8 @@ pub(super) struct Job {
     pub stage: Option<String>,
     /// 0 to 1.
     pub progress: f64,
+    /// Higher runs earlier; 0 is usual.
+    pub priority: i64,
     /// Seconds left, as the job estimates.
     pub eta_s: Option<f64>,
     /// Starts so far.
@@ -56,6 +60,8 @@ pub(super) struct Job {
     pub max_attempts: i64,
     /// Whether a cancel is on its way to the worker.
     pub cancel_requested: bool,
+    /// Who sent it: the label of the key.
+    pub sent_by: Option<String>,
     /// What was sent.
     pub input: InputShape,
     /// RFC 3339, UTC.
@@ -149,6 +155,7 @@ impl From<JobRow> for Job {
                 result: format!("{this}/result"),
                 cancel: format!("{this}/cancel"),
                 retry: format!("{this}/retry"),
+                plan: format!("{this}/plan"),
                 this,
             },
             input: InputShape { files: row.input_files, bytes: row.input_bytes, digest: row.input_digest },
@@ -157,10 +164,12 @@ impl From<JobRow> for Job {
             state: row.state,
             stage: row.stage,
             progress: row.progress,
+            priority: row.priority,
             eta_s: row.eta_s,
             attempt: row.attempt,
             max_attempts: row.max_attempts,
             cancel_requested: row.cancel_requested,
+            sent_by: row.sent_by,
             created_at: rfc3339(row.created_at),
             started_at: row.started_at.and_then(rfc3339),
             finished_at: row.finished_at.and_then(rfc3339),

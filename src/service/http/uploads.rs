@@ -3,20 +3,20 @@
 //! A client makes an upload (POST), sends its bytes in one or more PATCH calls, asks after a break how much arrived (HEAD),
 //! and names the upload in `POST /v1/jobs`. What arrived before a break is kept, unless a checksum was promised for it.
 
-use super::multipart::{self, Budget, LARGEST_PLAN};
+use super::multipart::Budget;
 use super::problems::TraceId;
 use crate::auth::Principal;
+use crate::config::NamedBytes;
 use crate::error::Problem;
 use crate::media::base64_bytes;
 use crate::state::State;
 use crate::uploads::{self, FRAME, Partial, Ticket};
-use axum::body::{Body, to_bytes};
+use axum::body::Body;
 use axum::extract::{Extension, Path, Request, State as Shared};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use futures::StreamExt as _;
 use ring::digest;
-use serde::Deserialize;
 use std::io::ErrorKind;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -34,41 +34,22 @@ pub(super) fn router() -> OpenApiRouter<State> {
     OpenApiRouter::new().routes(routes!(create, abilities)).routes(routes!(offset, append, remove))
 }
 
-/// An upload to make a job of.
-#[derive(Debug, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(super) struct FromUpload {
-    /// The last part of the upload's address.
-    #[schema(pattern = "^[0-9a-f]{96}$")]
-    upload: String,
-    /// plan.json.
-    #[schema(value_type = Option<Object>)]
-    plan: Option<serde_json::Value>,
-}
-
-/// The files and the plan of a body that names an upload, and the upload's id.
+/// The file of a finished upload, and the upload's id.
 pub(super) async fn taken(
     state: &State,
     who: &Principal,
-    body: Body,
-) -> Result<(multipart::Upload, uuid::Uuid), Problem> {
-    let bytes = to_bytes(body, LARGEST_PLAN).await.map_err(|_| too_large(LARGEST_PLAN as u64))?;
-    let named: FromUpload = serde_json::from_slice(&bytes).map_err(|e| {
-        bad("bad_request", format!("Send {{\"upload\": ID, \"plan\": {{...}}}}: {e}.")).with_status(422)
-    })?;
-    let (ticket, length) = known(state, who, &named.upload).await?;
-    let mut budget = Budget::default();
+    address: &str,
+    budget: &mut Budget,
+) -> Result<(NamedBytes, uuid::Uuid), Problem> {
+    let (ticket, length) = known(state, who, address).await?;
     budget.grow(state, usize::try_from(length).map_err(Problem::internal)?)?;
-    let plan = named.plan.map_or_else(|| "{}".to_owned(), |plan| plan.to_string());
-    (state.config.check_plan)(plan.as_bytes())?;
     let partial = opened(state, &ticket).await?;
     if partial.offset != length {
         let detail = format!("The upload has {} of {length} bytes: send the rest first.", partial.offset);
         return Err(Problem::new(StatusCode::CONFLICT, "upload.unfinished", detail));
     }
     let id = ticket.id;
-    let file = on_disk(move || partial.read()).await?;
-    Ok((multipart::Upload { plan, files: vec![file], budget }, id))
+    Ok((on_disk(move || partial.read()).await?, id))
 }
 
 /// Tells what this server's uploads can.

@@ -167,6 +167,27 @@ impl Queue {
         Ok(row)
     }
 
+    /// Moves a queued job within the queue. Returns the row after, or `None` when it is not a queued job of this tenant.
+    ///
+    /// # Errors
+    /// The database's.
+    pub async fn prioritise(&self, tenant: &str, id: Uuid, priority: i64) -> sqlx::Result<Option<JobRow>> {
+        let sql = "UPDATE job SET rank = rank - ($3 - priority) * $4, priority = $3, revision = revision + 1 \
+                   WHERE id = $1 AND tenant = $2 AND state = 'queued' RETURNING *";
+        let owner = tenant.to_owned();
+        let row = self
+            .db()
+            .write(Scope::Tenant(tenant), move |tx| {
+                Box::pin(async move {
+                    let row = tx.row(sql, args![id, &owner, priority, AGEING_MS]).await?;
+                    row.as_ref().map(JobRow::of).transpose()
+                })
+            })
+            .await?;
+        self.hint(id);
+        Ok(row)
+    }
+
     /// Erases a job with its events and artefact rows. A worker that still runs it loses its lease at the next beat.
     /// Returns whether there was one.
     ///

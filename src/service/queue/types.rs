@@ -83,6 +83,8 @@ pub struct JobRow {
     pub cancel_requested: bool,
     /// Problem body of a failed job.
     pub error: Option<String>,
+    /// Label of the key that sent it, where it is known.
+    pub sent_by: Option<String>,
     /// Trace of the request that made it.
     pub trace_id: String,
     /// Grows with every visible change.
@@ -120,6 +122,7 @@ impl JobRow {
             eta_s: row.get("eta_s")?,
             cancel_requested: row.flag("cancel_requested")?,
             error: row.get("error")?,
+            sent_by: row.get("sent_by")?,
             trace_id: row.get("trace_id")?,
             revision: row.get("revision")?,
             created_at: row.get("created_at")?,

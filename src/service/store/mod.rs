@@ -189,6 +189,22 @@ impl Store {
         Ok(())
     }
 
+    /// A stored input in memory, digests checked.
+    ///
+    /// # Errors
+    /// The store's; a digest that does not match.
+    pub async fn input(&self, job: Uuid, wanted: &str) -> Result<Vec<(String, Vec<u8>)>, Error> {
+        let manifest = self.verified(&input_key(job, "manifest.json"), wanted).await?;
+        let files: Vec<InputFile> =
+            serde_json::from_slice(&manifest).map_err(|source| Error::Manifest { job, source })?;
+        let mut read = Vec::with_capacity(files.len());
+        for (i, file) in files.into_iter().enumerate() {
+            let bytes = self.verified(&input_key(job, &format!("{i:06}")), &file.digest).await?;
+            read.push((file.name, bytes.into()));
+        }
+        Ok(read)
+    }
+
     async fn verified(&self, key: &Key, wanted: &str) -> Result<bytes::Bytes, Error> {
         let bytes = self.objects.get(key).await?.bytes().await?;
         let found = digest(&bytes);

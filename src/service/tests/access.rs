@@ -128,7 +128,7 @@ async fn monitors_see_the_truth() {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_is_strict() {
     let service = Service::start().await;
-    for path in ["/", "/portal/app.js", "/portal/style.css", "/portal/view3d.js"] {
+    for path in ["/", "/portal/main.js", "/portal/style.css", "/portal/view3d.js"] {
         let response = service.get(path).await;
         assert_eq!(response.status(), StatusCode::OK, "{path}");
         let policy = response.headers()["content-security-policy"].to_str().unwrap().to_owned();
@@ -136,7 +136,7 @@ async fn the_page_is_strict() {
         assert_eq!(response.headers()["x-content-type-options"], "nosniff");
         let text = response.text().await.unwrap();
         if path == "/" {
-            assert!(text.contains("/portal/app.js") && !text.contains(" style=") && !text.contains(" onclick="));
+            assert!(text.contains("/portal/main.js") && !text.contains(" style=") && !text.contains(" onclick="));
         }
     }
     service.stop().await;

@@ -27,6 +27,10 @@ enum Rule {
     Change,
     /// Auditor and admin.
     Audit,
+    /// Admin.
+    Administer,
+    /// Any key.
+    Keyed,
 }
 
 const RULES: &[(&str, &str, Rule)] = &[
@@ -36,6 +40,15 @@ const RULES: &[(&str, &str, Rule)] = &[
     ("GET", "/version", Rule::Open),
     ("POST", "/v1/session", Rule::Open),
     ("DELETE", "/v1/session", Rule::Open),
+    ("GET", "/v1/session", Rule::Keyed),
+    ("GET", "/v1/keys", Rule::Administer),
+    ("POST", "/v1/keys", Rule::Administer),
+    ("DELETE", "/v1/keys/{id}", Rule::Administer),
+    ("GET", "/v1/tenant", Rule::Administer),
+    ("PUT", "/v1/tenant", Rule::Administer),
+    ("GET", "/v1/jobs/{id}/plan", Rule::Read),
+    ("POST", "/v1/jobs/{id}/links", Rule::Change),
+    ("POST", "/v1/jobs/{id}/priority", Rule::Change),
     ("GET", "/v1/stats", Rule::Read),
     ("GET", "/v1/workers", Rule::Read),
     ("GET", "/v1/audit", Rule::Audit),
@@ -67,6 +80,8 @@ fn may(rule: Rule, role: Role) -> bool {
         Rule::Open => true,
         Rule::Read => role != Role::Auditor,
         Rule::Change => matches!(role, Role::Upload | Role::Admin),
+        Rule::Administer => role == Role::Admin,
+        Rule::Keyed => true,
         Rule::Audit => matches!(role, Role::Auditor | Role::Admin),
     }
 }
