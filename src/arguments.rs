@@ -84,6 +84,28 @@ pub(crate) struct Serve {
     /// No API keys: only on a loopback address.
     #[arg(long)]
     pub(crate) no_auth: bool,
+    #[command(flatten)]
+    pub(crate) oidc: OidcArgs,
+}
+
+/// An identity provider (OpenID Connect) whose bearer tokens count beside API keys.
+#[derive(Args)]
+pub(crate) struct OidcArgs {
+    /// `iss` of the identity provider's tokens; with it, bearer tokens count beside API keys.
+    #[arg(long, env = "VASCULUM_OIDC_ISSUER", requires_all = ["oidc_audience", "oidc_jwks_url"])]
+    pub(crate) oidc_issuer: Option<String>,
+    /// `aud` that a token for this service carries.
+    #[arg(long, env = "VASCULUM_OIDC_AUDIENCE", requires = "oidc_issuer")]
+    pub(crate) oidc_audience: Option<String>,
+    /// Where the provider's public keys are (JSON Web Key Set); https, or http on this machine.
+    #[arg(long, env = "VASCULUM_OIDC_JWKS_URL", requires = "oidc_issuer")]
+    pub(crate) oidc_jwks_url: Option<String>,
+    /// Claim that names the tenant (which must exist); dots lead into objects.
+    #[arg(long, env = "VASCULUM_OIDC_TENANT_CLAIM", default_value = "tenant")]
+    pub(crate) oidc_tenant_claim: String,
+    /// Claim that names the role (upload, read, admin, auditor), or a list of which the strongest counts.
+    #[arg(long, env = "VASCULUM_OIDC_ROLE_CLAIM", default_value = "role")]
+    pub(crate) oidc_role_claim: String,
 }
 
 #[derive(Args)]

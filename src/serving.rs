@@ -1,9 +1,9 @@
 //! `serve`, `work`, `migrate`, `key`, `openapi`.
 
-use crate::arguments::{Backup, Data, Key, KeyAction, Serve, VerifyAudit};
+use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
 use service::auth::{Role, keys, keys::NewKey};
-use service::{Auth, Config, Problem, audit};
+use service::{Auth, Config, Oidc, Problem, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -120,8 +120,20 @@ fn config(a: Serve) -> Config {
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
+        oidc: oidc(a.oidc),
         ..data_config(a.data)
     }
+}
+
+fn oidc(a: OidcArgs) -> Option<Oidc> {
+    Some(Oidc {
+        issuer: a.oidc_issuer?,
+        audience: a.oidc_audience?,
+        jwks_url: a.oidc_jwks_url?,
+        tenant_claim: a.oidc_tenant_claim,
+        role_claim: a.oidc_role_claim,
+        ..Oidc::default()
+    })
 }
 
 fn intake(files: Vec<(String, Vec<u8>)>) -> Result<Vec<(String, Vec<u8>)>, Problem> {

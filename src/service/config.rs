@@ -24,6 +24,36 @@ pub enum Auth {
     None,
 }
 
+/// An identity provider whose bearer tokens count beside API keys.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Oidc {
+    /// `iss` of its tokens.
+    pub issuer: String,
+    /// `aud` that a token for this service carries.
+    pub audience: String,
+    /// Where its public keys are (JSON Web Key Set).
+    pub jwks_url: String,
+    /// Claim that names the tenant; dots lead into objects. Default `tenant`.
+    pub tenant_claim: String,
+    /// Claim that names the role, or a list of roles. Default `role`.
+    pub role_claim: String,
+    /// The keys are not fetched more often than this for a key that is not known, seconds. Default 60.
+    pub refresh_seconds: u64,
+}
+
+impl Default for Oidc {
+    fn default() -> Self {
+        Self {
+            issuer: String::new(),
+            audience: String::new(),
+            jwks_url: String::new(),
+            tenant_claim: "tenant".to_owned(),
+            role_claim: "role".to_owned(),
+            refresh_seconds: 60,
+        }
+    }
+}
+
 /// Settings of the service. `Default` gives one machine: SQLite and a local folder, loopback, keys required.
 #[derive(Clone, Debug)]
 pub struct Config {
@@ -51,6 +81,8 @@ pub struct Config {
     pub job_seconds: u64,
     /// Who may call. Default [`Auth::Required`].
     pub auth: Auth,
+    /// An identity provider whose tokens count too. Default none.
+    pub oidc: Option<Oidc>,
     /// The program whose `exec-job` sub-command runs one job. Default: this program.
     pub executable: PathBuf,
     /// Arguments put before `exec-job` (none by default; an interpreter's script in tests).
@@ -88,6 +120,7 @@ impl Default for Config {
             workers: 1,
             threads: 0,
             auth: Auth::Required,
+            oidc: None,
             executable: std::env::current_exe().unwrap_or_else(|_| PathBuf::from("vasculum")),
             executable_args: Vec::new(),
             max_body: 2 << 30,

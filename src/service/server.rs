@@ -54,6 +54,7 @@ impl Server {
             !config.is_shared() || config.workers == 0 || config.store_url.is_some(),
             "workers of several machines need one store: give --store-url with PostgreSQL (or --workers 0)"
         );
+        let provider = config.oidc.as_ref().map(auth::Provider::new).transpose()?.map(Arc::new);
         let lock = lock(&config.data_dir)?;
         let listener =
             TcpListener::bind(config.listen).await.with_context(|| format!("cannot listen on {}", config.listen))?;
@@ -81,6 +82,7 @@ impl Server {
             queue: parts.queue,
             store: parts.store,
             worker,
+            provider,
             shutdown: shutdown.clone(),
             metrics: telemetry::recorder(),
             address,

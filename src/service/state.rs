@@ -1,7 +1,7 @@
 //! What every request handler shares.
 
 use crate::audit::{self, Entry};
-use crate::auth::Principal;
+use crate::auth::{Principal, Provider};
 use crate::config::Config;
 use crate::error::Problem;
 use crate::queue::Queue;
@@ -27,6 +27,8 @@ pub struct State {
     pub store: Store,
     /// The workers of this process, if any.
     pub worker: Option<Arc<Worker>>,
+    /// Who checks bearer tokens that are no API keys.
+    pub provider: Option<Arc<Provider>>,
     /// Memory for uploads, in units of [`UPLOAD_UNIT`].
     pub uploads: Arc<Semaphore>,
     /// Ends streams and long polls.

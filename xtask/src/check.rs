@@ -18,6 +18,7 @@ pub(crate) fn all() -> Result<()> {
     lint()?;
     let mut test = shell::command("cargo");
     tools::postgres()?;
+    tools::openssl()?;
     // Its lack is then a failure of the queue's tests, not a reason to skip them.
     test.args(["test", "--workspace", "--quiet"])
         .env("VASCULUM_POSTGRES", "required")

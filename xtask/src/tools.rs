@@ -90,6 +90,14 @@ pub(crate) fn postgres() -> Result<()> {
     apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
 }
 
+/// Keys and certificates of the tests' own.
+pub(crate) fn openssl() -> Result<()> {
+    if shell::has("openssl") {
+        return Ok(());
+    }
+    apt("OpenSSL (the tests make keys and certificates with it)", &["openssl"])
+}
+
 /// Programs that read the files of deploy/.
 pub(crate) fn deploy() -> Result<()> {
     if shell::has("promtool") && PathBuf::from("/usr/sbin/nginx").exists() {

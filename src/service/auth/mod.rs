@@ -2,10 +2,15 @@
 //!
 //! A key is `vsk_` and 256 random bits in hexadecimal; only its SHA-256 is stored (nothing of low entropy, so no slow
 //! hash). It comes as `Authorization: Bearer` or, for the portal's own page, as an HttpOnly SameSite=Strict cookie
-//! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
+//! that `POST /v1/session` sets; a changing call by cookie must come from the same origin. Whatever else comes as a bearer
+//! is a token of the configured identity provider ([`oidc`]), or nothing.
 
+mod jwks;
 pub mod keys;
+mod oidc;
 mod pace;
+
+pub use oidc::Provider;
 
 use crate::config::Auth;
 use crate::db::{Db, Scope, args};
@@ -82,7 +87,7 @@ pub struct Principal {
     pub tenant: String,
     /// What may be done.
     pub role: Role,
-    /// Which key: its id, for the audit. `open` for a service without keys.
+    /// Which key: its id, for the audit. `oidc:` and the subject of a token; `open` for a service without keys.
     pub actor: String,
     /// Largest upload of this key, bytes.
     pub max_bytes: Option<u64>,
@@ -135,6 +140,17 @@ pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
     Ok(Principal { tenant: row.get("tenant")?, role, actor: id, max_bytes })
 }
 
+/// The caller of an API key or of a token.
+///
+/// # Errors
+/// `auth.key`, `auth.token` and what else the check says; the database's.
+pub async fn known(state: &State, secret: &str) -> Result<Principal, Problem> {
+    match &state.provider {
+        Some(provider) if !secret.starts_with(KEY_PREFIX) => provider.principal(state.queue.db(), secret).await,
+        _ => principal(state.queue.db(), secret).await,
+    }
+}
+
 fn unauthorized(code: &str, detail: &str) -> Problem {
     Problem::new(StatusCode::UNAUTHORIZED, code, detail).with_header("www-authenticate", "Bearer realm=\"vasculum\"")
 }
@@ -182,7 +198,11 @@ impl Caller {
         if self.0.role.may(action) {
             Ok(self.0)
         } else {
-            Err(Problem::new(StatusCode::FORBIDDEN, "auth.role", "This API key may not do that. Ask the operator."))
+            Err(Problem::new(
+                StatusCode::FORBIDDEN,
+                "auth.role",
+                "This key or token may not do that. Ask the operator.",
+            ))
         }
     }
 }
@@ -210,7 +230,7 @@ impl FromRequestParts<State> for Caller {
                 "auth.origin",
                 "A page of another origin may not change anything here by cookie.",
             )),
-            Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
+            Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(known(state, key).await?)),
         }
     }
 }
