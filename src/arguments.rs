@@ -78,6 +78,9 @@ pub(crate) struct Serve {
     /// Longest time of one job, seconds; 0: no bound.
     #[arg(long, default_value_t = 21_600)]
     pub(crate) job_seconds: u64,
+    /// A series that is sent by DICOMweb is run when nothing more of it has come for this long, seconds.
+    #[arg(long, default_value_t = 30, env = "VASCULUM_STOW_QUIET_SECONDS")]
+    pub(crate) stow_quiet_seconds: u64,
     /// A host to which webhooks may go though its network is not public; may be given several times.
     #[arg(long = "webhook-host")]
     pub(crate) webhook_hosts: Vec<String>,

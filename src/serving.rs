@@ -3,7 +3,7 @@
 use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
 use service::auth::{Role, keys, keys::NewKey};
-use service::{Auth, Config, Oidc, Problem, audit};
+use service::{Auth, Config, Instance, Oidc, Problem, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -106,6 +106,7 @@ fn data_config(a: Data) -> Config {
             .filter_map(|(name, value)| Some((name.strip_prefix("VASCULUM_S3_")?.to_owned(), value)))
             .collect(),
         intake,
+        receive,
         check_plan,
         ..Config::default()
     }
@@ -119,6 +120,7 @@ fn config(a: Serve) -> Config {
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
+        stow_quiet_seconds: a.stow_quiet_seconds,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         oidc: oidc(a.oidc),
         ..data_config(a.data)
@@ -140,6 +142,13 @@ fn intake(files: Vec<(String, Vec<u8>)>) -> Result<Vec<(String, Vec<u8>)>, Probl
     let files = files.into_iter().map(|(name, bytes)| NamedBytes { name, bytes }).collect();
     let taken = artefact::read::intake(files, &Limits::default()).map_err(|e| Problem::from_fault(&e))?;
     Ok(taken.into_iter().map(|f| (f.name, f.bytes)).collect())
+}
+
+fn receive(bytes: &[u8]) -> Instance {
+    let (names, file) = artefact::read::instance(bytes, &Limits::default());
+    let file = file.and_then(|file| file.ok_or(artefact::read::Error::NoImages { files: 1 }));
+    let file = file.map_err(|e| Problem::from_fault(&e));
+    Instance { class: names.class, instance: names.instance, study: names.study, series: names.series, file }
 }
 
 fn check_plan(bytes: &[u8]) -> Result<(), Problem> {

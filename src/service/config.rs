@@ -12,6 +12,24 @@ pub type NamedBytes = (String, Vec<u8>);
 /// cannot be read. Runs on a blocking thread.
 pub type Intake = fn(Vec<NamedBytes>) -> Result<Vec<NamedBytes>, Problem>;
 
+/// A DICOM instance as it was received: its names for the answer to its sender, and the file to keep.
+#[derive(Clone, Debug)]
+pub struct Instance {
+    /// SOPClassUID.
+    pub class: String,
+    /// SOPInstanceUID.
+    pub instance: String,
+    /// StudyInstanceUID.
+    pub study: String,
+    /// SeriesInstanceUID.
+    pub series: String,
+    /// The de-identified file, or why it is not taken.
+    pub file: Result<Vec<u8>, Problem>,
+}
+
+/// Reads one DICOM instance, de-identifies it. Runs on a blocking thread.
+pub type Receive = fn(&[u8]) -> Instance;
+
 /// Checks the bytes of a plan; every fault at once.
 pub type CheckPlan = fn(&[u8]) -> Result<(), Problem>;
 
@@ -100,6 +118,10 @@ pub struct Config {
     pub min_free_disk: u64,
     /// Reads an upload. Default: takes the files as they are; the binary wires `artefact::read::intake`.
     pub intake: Intake,
+    /// Reads a DICOM instance of DICOMweb. Default: takes none; the binary wires `artefact::read::instance`.
+    pub receive: Receive,
+    /// A series that comes over DICOMweb is run when nothing more of it has come for this long, seconds. Default 30.
+    pub stow_quiet_seconds: u64,
     /// Checks a plan. Default: any JSON object; the binary wires the artefact crate's reader.
     pub check_plan: CheckPlan,
 }
@@ -127,6 +149,8 @@ impl Default for Config {
             upload_memory: 4 << 30,
             min_free_disk: 256 << 20,
             intake: Ok,
+            receive: crate::intake::no_instance,
+            stow_quiet_seconds: 30,
             check_plan: crate::intake::json_object,
         }
     }

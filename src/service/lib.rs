@@ -25,7 +25,7 @@ mod uploads;
 pub mod webhooks;
 pub mod worker;
 
-pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes, Oidc};
+pub use config::{Auth, CheckPlan, Config, Instance, Intake, NamedBytes, Oidc, Receive};
 pub use error::{PROBLEM_JSON, Problem, place_json};
 pub use server::{Server, migrate, open_database, serve, work};
 

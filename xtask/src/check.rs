@@ -69,6 +69,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     shell::run(survey)?;
     let python = tools::python()?;
     tools::deploy()?;
+    tools::pacs()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge

@@ -29,6 +29,8 @@ const PYTHON_PACKAGES: &[&str] = &[
     "schemathesis==4.32.5",
     "kubernetes-validate==1.37.0",
     "podman-compose==1.6.0",
+    "dicomweb-client==0.61.2",
+    "requests<3",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
@@ -104,6 +106,14 @@ pub(crate) fn deploy() -> Result<()> {
         return Ok(());
     }
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
+}
+
+/// A PACS that sends by DICOMweb, and what feeds it. The package's own service is of no use here.
+pub(crate) fn pacs() -> Result<()> {
+    if PathBuf::from("/usr/sbin/Orthanc").exists() && shell::has("storescu") {
+        return Ok(());
+    }
+    apt("Orthanc and dcmtk (they send a series by DICOMweb)", &["orthanc", "orthanc-dicomweb", "dcmtk"])
 }
 
 /// An S3 server that checks signatures and checksums, for the store's tests; its program.

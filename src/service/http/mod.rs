@@ -14,6 +14,7 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod stow;
 mod uploads;
 mod webhooks;
 mod workers;
@@ -45,6 +46,7 @@ const SMALL_BODY: usize = 64 << 10;
     modifiers(&Keys),
     tags(
         (name = "jobs", description = "Send a scan, follow it, end it"),
+        (name = "dicomweb", description = "Send a series from a PACS or a viewer (STOW-RS)"),
         (name = "results", description = "What a job made"),
         (name = "webhooks", description = "Be told when a job ends"),
         (name = "monitoring", description = "Is it well, and how busy is it")
@@ -71,6 +73,7 @@ fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
         .merge(uploads::router())
+        .merge(stow::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())

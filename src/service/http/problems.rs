@@ -20,6 +20,10 @@ const LONGEST_TEXT: usize = 4096;
 #[derive(Clone, Debug)]
 pub(crate) struct TraceId(pub String);
 
+/// Marks an answer of an error's status whose body is what its standard says, and no problem.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Whole;
+
 /// The layer.
 pub(crate) async fn layer(mut request: Request, next: Next) -> Response {
     let begun = Instant::now();
@@ -30,7 +34,8 @@ pub(crate) async fn layer(mut request: Request, next: Next) -> Response {
     request.extensions_mut().insert(TraceId(trace.clone()));
     let span = tracing::info_span!("request", %method, route = %route, trace_id = %trace);
     let mut response = next.run(request).instrument(span).await;
-    if response.status().is_client_error() || response.status().is_server_error() {
+    let failed = response.status().is_client_error() || response.status().is_server_error();
+    if failed && response.extensions_mut().remove::<Whole>().is_none() {
         response = told(response, &path, &trace).await;
     }
     if let Ok(value) = HeaderValue::from_str(&trace) {

@@ -6,10 +6,11 @@
 //! seen event N has seen everything before it. Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
-//! `submit` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
+//! `submit`, `gather` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
 
 mod claim;
 mod finish;
+mod gather;
 mod keep;
 mod read;
 pub(crate) mod submit;
@@ -17,6 +18,7 @@ mod types;
 
 pub use claim::{Beat, Claim, Room, Verdict};
 pub use finish::{Closing, Published};
+pub use gather::Grown;
 pub use keep::WorkerRow;
 pub use read::{Counts, Page};
 pub use submit::{NewJob, Submitted};
