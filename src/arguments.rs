@@ -66,6 +66,12 @@ pub(crate) struct Serve {
     /// Address of the API and the portal; port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:8080", env = "VASCULUM_LISTEN")]
     pub(crate) listen: SocketAddr,
+    /// Certificate of the listener with its chain, PEM; read again when it changes or on SIGHUP. Plain HTTP without.
+    #[arg(long, env = "VASCULUM_TLS_CERT", requires = "tls_key")]
+    pub(crate) tls_cert: Option<PathBuf>,
+    /// The certificate's private key, PEM.
+    #[arg(long, env = "VASCULUM_TLS_KEY", requires = "tls_cert")]
+    pub(crate) tls_key: Option<PathBuf>,
     /// Jobs at the same time.
     #[arg(long, default_value_t = 1)]
     pub(crate) workers: usize,

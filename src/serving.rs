@@ -3,7 +3,7 @@
 use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
 use service::auth::{Role, keys, keys::NewKey};
-use service::{Auth, Config, Instance, Oidc, Problem, audit};
+use service::{Auth, Config, Instance, Oidc, Problem, Tls, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -115,6 +115,7 @@ fn data_config(a: Data) -> Config {
 fn config(a: Serve) -> Config {
     Config {
         listen: a.listen,
+        tls: a.tls_cert.zip(a.tls_key).map(|(cert, key)| Tls { cert, key }),
         workers: a.workers,
         threads: a.threads.unwrap_or(0),
         memory_mb: a.memory_mb,

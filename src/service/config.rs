@@ -2,6 +2,7 @@
 //! reads either.
 
 use crate::error::Problem;
+use crate::tls::Tls;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -80,6 +81,8 @@ pub struct Config {
     /// Address to listen on; port 0 takes a free one, printed and written to `<data_dir>/listen`.
     /// Default 127.0.0.1:8080.
     pub listen: SocketAddr,
+    /// Certificate of the listener; without one it speaks plain HTTP. Default none.
+    pub tls: Option<Tls>,
     /// `sqlite:PATH` or `postgres://USER:PASSWORD@HOST/DATABASE`; default `sqlite:<data_dir>/vasculum.sqlite`.
     pub database_url: Option<String>,
     /// Connections to PostgreSQL that this process may hold (plus one for beats and one for hints). Default 8.
@@ -131,6 +134,7 @@ impl Default for Config {
         Self {
             data_dir: PathBuf::from("vasculum-data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            tls: None,
             database_url: None,
             database_connections: 8,
             store_url: None,

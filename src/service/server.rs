@@ -9,6 +9,7 @@ use crate::queue::Queue;
 use crate::state::{State, UPLOAD_UNIT};
 use crate::store::Store;
 use crate::telemetry;
+use crate::tls::Identity;
 use crate::worker::{Heartbeat, Memory, Owner, Worker};
 use anyhow::{Context as _, bail};
 use std::fs::{File, TryLockError};
@@ -28,6 +29,7 @@ const FAREWELL: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
+    scheme: &'static str,
     first_key: Option<String>,
     shutdown: CancellationToken,
     tasks: JoinSet<()>,
@@ -55,6 +57,7 @@ impl Server {
             "workers of several machines need one store: give --store-url with PostgreSQL (or --workers 0)"
         );
         let provider = config.oidc.as_ref().map(auth::Provider::new).transpose()?.map(Arc::new);
+        let identity = config.tls.as_ref().map(Identity::read).transpose()?.map(Arc::new);
         let lock = lock(&config.data_dir)?;
         let listener =
             TcpListener::bind(config.listen).await.with_context(|| format!("cannot listen on {}", config.listen))?;
@@ -88,14 +91,23 @@ impl Server {
             address,
         };
         let db = state.queue.db().clone();
-        tasks.spawn(http::listen(listener, http::router(state), shutdown.clone()));
-        std::fs::write(config.data_dir.join("listen"), format!("http://{address}\n"))?;
-        Ok(Self { address, first_key, shutdown, tasks, db, _lock: lock })
+        if let Some(identity) = &identity {
+            tasks.spawn(Arc::clone(identity).follow(shutdown.clone()));
+        }
+        let scheme = if identity.is_some() { "https" } else { "http" };
+        tasks.spawn(http::listen(listener, identity, http::router(state), shutdown.clone()));
+        std::fs::write(config.data_dir.join("listen"), format!("{scheme}://{address}\n"))?;
+        Ok(Self { address, scheme, first_key, shutdown, tasks, db, _lock: lock })
     }
 
     /// The address really listened on.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// `https` with a certificate, else `http`.
+    pub fn scheme(&self) -> &'static str {
+        self.scheme
     }
 
     /// The admin key that this start made; shown once and stored nowhere.
@@ -179,17 +191,18 @@ fn lock(data_dir: &Path) -> anyhow::Result<File> {
     }
 }
 
-/// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` on stdout, and at the
+/// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` (or `https://...`) on stdout, and at the
 /// first start the admin key with a portal link that carries it.
 ///
 /// # Errors
 /// See [`Server::start`].
 pub async fn serve(config: Config) -> anyhow::Result<()> {
     let server = Server::start(config).await?;
-    say(&format!("listening on http://{}", server.address()))?;
+    let scheme = server.scheme();
+    say(&format!("listening on {scheme}://{}", server.address()))?;
     if let Some(key) = server.first_key() {
         say(&format!("admin key (shown once): {key}"))?;
-        say(&format!("portal: http://{}/#key={key}", server.address()))?;
+        say(&format!("portal: {scheme}://{}/#key={key}", server.address()))?;
     }
     stop_signal().await?;
     tracing::info!("stopping");

@@ -92,12 +92,12 @@ pub(crate) fn postgres() -> Result<()> {
     apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
 }
 
-/// Keys and certificates of the tests' own.
+/// Keys and certificates of the tests' own, and a client that trusts them.
 pub(crate) fn openssl() -> Result<()> {
-    if shell::has("openssl") {
+    if shell::has("openssl") && shell::has("curl") {
         return Ok(());
     }
-    apt("OpenSSL (the tests make keys and certificates with it)", &["openssl"])
+    apt("OpenSSL and curl (the tests make keys and certificates and ask by them)", &["openssl", "curl"])
 }
 
 /// Programs that read the files of deploy/.

@@ -5,6 +5,7 @@
 //! (hyper answers 431), and a body must come at [`SLOWEST`] bytes a second or faster after its first [`PATIENCE`]
 //! (`upload.broken`, 400). Answers are not bounded: an event stream may live as long as its job.
 
+use crate::tls::Identity;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::Request;
@@ -13,13 +14,15 @@ use axum::response::Response;
 use futures::StreamExt as _;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
-use hyper_util::server::graceful::GracefulShutdown;
+use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use hyper_util::service::TowerToHyperService;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Instant;
+use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
 /// A request's headers must be whole within this time.
@@ -36,7 +39,12 @@ const CONNECTIONS: usize = 4096;
 const PAUSE: Duration = Duration::from_millis(50);
 
 /// Serves until shutdown, then lets open requests end.
-pub(crate) async fn listen(listener: TcpListener, router: Router, shutdown: CancellationToken) {
+pub(crate) async fn listen(
+    listener: TcpListener,
+    identity: Option<Arc<Identity>>,
+    router: Router,
+    shutdown: CancellationToken,
+) {
     let room = Arc::new(Semaphore::new(CONNECTIONS));
     let graceful = GracefulShutdown::new();
     loop {
@@ -47,7 +55,8 @@ pub(crate) async fn listen(listener: TcpListener, router: Router, shutdown: Canc
         match accepted {
             Ok((stream, _)) => match Arc::clone(&room).try_acquire_owned() {
                 Ok(permit) => {
-                    tokio::spawn(connection(stream, router.clone(), graceful.watcher(), permit));
+                    let identity = identity.clone();
+                    tokio::spawn(greeted(stream, identity, router.clone(), graceful.watcher(), permit));
                 }
                 Err(_) => tracing::warn!(most = CONNECTIONS, "a connection was closed: there are too many"),
             },
@@ -61,14 +70,30 @@ pub(crate) async fn listen(listener: TcpListener, router: Router, shutdown: Canc
     graceful.shutdown().await;
 }
 
-async fn connection(
+/// A connection after its TLS handshake, where there is one: it must be done within [`HEADERS`] too.
+async fn greeted(
     stream: TcpStream,
+    identity: Option<Arc<Identity>>,
     router: Router,
-    watcher: hyper_util::server::graceful::Watcher,
+    watcher: Watcher,
     permit: OwnedSemaphorePermit,
 ) {
     // Small answers go out at once; a socket that cannot do that still works.
     let _ = stream.set_nodelay(true);
+    let Some(identity) = identity else { return connection(stream, router, watcher, permit).await };
+    match tokio::time::timeout(HEADERS, TlsAcceptor::from(identity.now()).accept(stream)).await {
+        Ok(Ok(stream)) => connection(stream, router, watcher, permit).await,
+        Ok(Err(error)) => tracing::debug!(%error, "no TLS came about"),
+        Err(_) => tracing::debug!("a TLS handshake took too long"),
+    }
+}
+
+async fn connection(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    router: Router,
+    watcher: Watcher,
+    permit: OwnedSemaphorePermit,
+) {
     let mut builder = Builder::new(TokioExecutor::new());
     builder.http1().timer(TokioTimer::new()).header_read_timeout(HEADERS).max_buf_size(HEADER_BYTES);
     builder.http2().timer(TokioTimer::new()).max_header_list_size(16 << 10).max_concurrent_streams(100);

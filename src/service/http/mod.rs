@@ -110,7 +110,7 @@ pub(crate) fn router(state: State) -> Router {
         .layer(from_fn(listen::paced))
         .layer(from_fn(guard::plain))
         .layer(from_fn_with_state(state.clone(), guard::host))
-        .layer(from_fn(guard::headers))
+        .layer(from_fn_with_state(state.clone(), guard::headers))
         .layer(from_fn(problems::layer))
         .with_state(state)
 }

@@ -33,7 +33,9 @@ async fn begin(Shared(state): Shared<State>, Json(session): Json<Session>) -> Re
     if state.config.auth == Auth::Required {
         known(&state, &session.key).await?;
     }
-    Ok(cookie(&format!("{COOKIE}={}; Path=/; HttpOnly; SameSite=Strict", session.key)))
+    // Behind our own TLS the cookie never goes over a plain line.
+    let secure = if state.config.tls.is_some() { "; Secure" } else { "" };
+    Ok(cookie(&format!("{COOKIE}={}; Path=/; HttpOnly; SameSite=Strict{secure}", session.key)))
 }
 
 /// Ends the session.
