@@ -2,6 +2,7 @@
 
 mod arguments;
 mod demo;
+mod isolation;
 mod jobs;
 mod phantoms;
 mod serving;

@@ -10,7 +10,7 @@ use crate::state::{State, UPLOAD_UNIT};
 use crate::store::Store;
 use crate::telemetry;
 use crate::tls::Identity;
-use crate::worker::{Heartbeat, Memory, Owner, Worker};
+use crate::worker::{Heartbeat, Isolation, Memory, Owner, Worker};
 use anyhow::{Context as _, bail};
 use std::fs::{File, TryLockError};
 use std::net::SocketAddr;
@@ -164,6 +164,7 @@ impl Parts {
             heartbeat: Heartbeat::start(&self.queue, Arc::clone(&owner))?,
             owner,
             memory: Memory::new(config.memory_mb, config.workers),
+            isolation: Isolation::default(),
             shutdown: shutdown.clone(),
         });
         tasks.spawn(Arc::clone(&worker).roll());

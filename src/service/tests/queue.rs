@@ -445,14 +445,15 @@ async fn workers_are_on_the_roll(b: Bench) {
         slots: 2,
         busy: 0,
         memory_mb: 100,
+        isolation: None,
         started_at: 0,
         seen_at: 0,
     };
     q.enrol(&worker).await.unwrap();
-    worker.busy = 1;
+    (worker.busy, worker.isolation) = (1, Some("filter".into()));
     q.enrol(&worker).await.unwrap();
     let roll = q.workers().await.unwrap();
-    assert_eq!((roll.len(), roll[0].busy), (1, 1));
+    assert_eq!((roll.len(), roll[0].busy, roll[0].isolation.as_deref()), (1, 1, Some("filter")));
     assert!(roll[0].seen_at > 0);
     q.strike_off("w").await.unwrap();
     assert!(q.workers().await.unwrap().is_empty());

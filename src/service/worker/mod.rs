@@ -10,10 +10,12 @@
 mod child;
 mod folder;
 mod heartbeat;
+mod isolation;
 mod memory;
 mod owner;
 
 pub use heartbeat::Heartbeat;
+pub use isolation::Isolation;
 pub use memory::Memory;
 pub(crate) use memory::expected_mb;
 pub use owner::Owner;
@@ -23,7 +25,7 @@ use crate::error::Problem;
 use crate::media::media_type;
 use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict, WorkerRow};
 use crate::store::Store;
-use child::{Child, Ended};
+use child::{Child, Ended, Step};
 use folder::Folder;
 use heartbeat::Held;
 use std::sync::Arc;
@@ -53,6 +55,8 @@ pub struct Worker {
     pub owner: Arc<Owner>,
     /// What jobs may take together.
     pub memory: Memory,
+    /// What the last job said to stand between it and the network.
+    pub isolation: Isolation,
     /// Ends everything.
     pub shutdown: CancellationToken,
 }
@@ -136,6 +140,7 @@ impl Worker {
         loop {
             tokio::select! {
                 line = child.next() => match line {
+                    Some(Step { isolation: Some(barriers), .. }) => self.isolation.told(barriers),
                     Some(step) => held.step(step),
                     None => return Ok(Some(child.end(&claim.id).await?)),
                 },
@@ -173,6 +178,7 @@ impl Worker {
                 slots: i64::try_from(self.config.workers).unwrap_or(i64::MAX),
                 busy: i64::try_from(self.heartbeat.held()).unwrap_or(i64::MAX),
                 memory_mb: self.memory.all(),
+                isolation: self.isolation.last(),
                 started_at: 0,
                 seen_at: 0,
             };
@@ -181,6 +187,7 @@ impl Worker {
             }
             tokio::select! {
                 () = self.shutdown.cancelled() => {}
+                () = self.isolation.changed() => {}
                 () = tokio::time::sleep(ROLL) => {}
             }
         }
