@@ -3,6 +3,7 @@
 mod artefacts;
 mod describe;
 mod events;
+mod examples;
 mod guard;
 mod health;
 mod jobs;
@@ -87,6 +88,7 @@ fn documented() -> OpenApiRouter<State> {
 pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
     let mut document = documented().into_openapi();
     describe::complete(&mut document);
+    examples::illustrate(&mut document);
     document
 }
 
@@ -94,6 +96,7 @@ pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
 pub(crate) fn router(state: State) -> Router {
     let (api, mut document) = documented().split_for_parts();
     describe::complete(&mut document);
+    examples::illustrate(&mut document);
     let document = Arc::new(document);
     let page = portal::router().layer(CompressionLayer::new());
     let described = Router::new()
