@@ -7,8 +7,9 @@
 
 use crate::tls::Identity;
 use axum::Router;
-use axum::body::Body;
+use axum::body::{Body, BodyDataStream};
 use axum::extract::Request;
+use axum::http::header;
 use axum::middleware::Next;
 use axum::response::Response;
 use futures::StreamExt as _;
@@ -20,7 +21,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
 use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
@@ -35,6 +36,11 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const SLOWEST: u64 = 1024;
 /// Most connections at the same time; one more is closed at once, so that descriptors are left for files.
 const CONNECTIONS: usize = 4096;
+/// Most bytes of a refused body that are read and dropped, so that its sender hears the answer.
+const DRAINED: usize = 16 << 20;
+/// Longest time for that, and longest pause in it.
+const DRAINING: Duration = Duration::from_secs(5);
+const IDLE: Duration = Duration::from_millis(300);
 /// After a failed accept (no descriptors left, say).
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -104,13 +110,18 @@ async fn connection(
     drop(permit);
 }
 
-/// Breaks off a body that does not come.
+/// Breaks off a body that does not come, and reads what a refusal left of one: a client that is still sending would see a
+/// broken connection in place of the answer (a database that was away, a revoked key). It reads up to [`DRAINED`] bytes
+/// for [`DRAINING`]; a client that asked first (Expect) has not begun to send.
 pub(super) async fn paced(request: Request, next: Next) -> Response {
+    let asked = request.headers().contains_key(header::EXPECT);
     let (parts, body) = request.into_parts();
-    let start = Instant::now();
-    let paced = futures::stream::unfold((body.into_data_stream(), 0_u64), move |(mut stream, mut seen)| async move {
+    let rest = Arc::new(Mutex::new(body.into_data_stream()));
+    let (start, shared) = (Instant::now(), Arc::clone(&rest));
+    let paced = futures::stream::unfold((shared, 0_u64), move |(stream, mut seen)| async move {
         let until = start + PATIENCE + Duration::from_secs(seen / SLOWEST);
-        let part = match tokio::time::timeout_at(until, stream.next()).await {
+        let next = async { stream.lock().await.next().await };
+        let part = match tokio::time::timeout_at(until, next).await {
             Ok(part) => part?,
             Err(_) => {
                 Err(axum::Error::new(std::io::Error::new(std::io::ErrorKind::TimedOut, "the body came too slowly")))
@@ -119,5 +130,22 @@ pub(super) async fn paced(request: Request, next: Next) -> Response {
         seen += part.as_ref().map_or(0, |bytes| bytes.len() as u64);
         Some((part, (stream, seen)))
     });
-    next.run(Request::from_parts(parts, Body::from_stream(paced))).await
+    let response = next.run(Request::from_parts(parts, Body::from_stream(paced))).await;
+    if !asked && (response.status().is_client_error() || response.status().is_server_error()) {
+        // Whoever is slower than this sees the broken connection.
+        let _ = tokio::time::timeout(DRAINING, drained(&rest)).await;
+    }
+    response
+}
+
+async fn drained(rest: &Mutex<BodyDataStream>) {
+    let mut rest = rest.lock().await;
+    let mut left = DRAINED;
+    // Who says a length and sends nothing is not waited for.
+    while let Ok(Some(Ok(part))) = tokio::time::timeout(IDLE, rest.next()).await {
+        left = left.saturating_sub(part.len());
+        if left == 0 {
+            return;
+        }
+    }
 }
