@@ -34,6 +34,8 @@ pub(crate) enum Command {
     Backup(Backup),
     /// API keys.
     Key(Key),
+    /// Tenants: what they may do and how long their jobs are kept.
+    Tenant(Tenant),
     /// Check that no line of the audit was changed, moved or taken out.
     VerifyAudit(VerifyAudit),
     /// Print the API's description (OpenAPI 3.1, YAML).
@@ -156,6 +158,34 @@ pub(crate) enum KeyAction {
         data: Data,
         /// The key's id, from the list.
         id: String,
+    },
+}
+
+#[derive(Args)]
+pub(crate) struct Tenant {
+    #[command(subcommand)]
+    pub(crate) action: TenantAction,
+}
+
+#[derive(Subcommand)]
+pub(crate) enum TenantAction {
+    /// Set a tenant's bounds; made if it is new. What is not given is lifted.
+    Set {
+        #[command(flatten)]
+        data: Data,
+        /// The tenant.
+        name: String,
+        /// Its jobs that may run at the same time.
+        #[arg(long, value_parser = clap::value_parser!(i64).range(1..))]
+        max_running: Option<i64>,
+        /// Days after which an ended job erases itself.
+        #[arg(long, value_parser = clap::value_parser!(i64).range(1..=36_500))]
+        keep_days: Option<i64>,
+    },
+    /// List every tenant with its bounds.
+    List {
+        #[command(flatten)]
+        data: Data,
     },
 }
 

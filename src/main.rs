@@ -27,6 +27,7 @@ fn main() -> ExitCode {
         Command::Migrate(a) => serving::migrate(a),
         Command::Backup(a) => serving::backup(a),
         Command::Key(a) => serving::key(a),
+        Command::Tenant(a) => serving::tenant(a),
         Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),
         Command::Openapi => serving::openapi(),

@@ -1,8 +1,8 @@
-//! `serve`, `work`, `migrate`, `key`, `openapi`.
+//! `serve`, `work`, `migrate`, `key`, `tenant`, `openapi`.
 
-use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, VerifyAudit};
+use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, Tenant, TenantAction, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
-use service::auth::{Role, keys, keys::NewKey};
+use service::auth::{Role, keys, keys::NewKey, tenants};
 use service::{Auth, Config, Instance, Oidc, Problem, Tls, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
@@ -58,6 +58,31 @@ pub(crate) fn key(a: Key) -> ExitCode {
                 let revoked = keys::revoke(&db, &id).await?;
                 db.close().await;
                 anyhow::ensure!(revoked, "there is no valid key {id}; `vasculum key list` shows them");
+            }
+        }
+        Ok(())
+    })
+}
+
+/// Set or list tenants.
+pub(crate) fn tenant(a: Tenant) -> ExitCode {
+    with_runtime(async move {
+        match a.action {
+            TenantAction::Set { data, name, max_running, keep_days } => {
+                let db = service::open_database(&data_config(data)).await?;
+                let keep_ms = keep_days.map(|days| days * 86_400_000);
+                tenants::set(&db, &name, max_running, keep_ms).await?;
+                db.close().await;
+            }
+            TenantAction::List { data } => {
+                let db = service::open_database(&data_config(data)).await?;
+                println!("{:<24}{:>12}{:>12}", "tenant", "max running", "kept, days");
+                let shown = |bound: Option<i64>| bound.map_or_else(|| "-".to_owned(), |n| n.to_string());
+                for row in tenants::list(&db).await? {
+                    let days = row.keep_ms.map(|ms| ms / 86_400_000);
+                    println!("{:<24}{:>12}{:>12}", row.id, shown(row.max_running), shown(days));
+                }
+                db.close().await;
             }
         }
         Ok(())

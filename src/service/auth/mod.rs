@@ -9,6 +9,7 @@ mod jwks;
 pub mod keys;
 mod oidc;
 mod pace;
+pub mod tenants;
 
 pub use oidc::Provider;
 

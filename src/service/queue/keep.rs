@@ -58,18 +58,6 @@ impl Queue {
         rows.iter().map(|row| Ok((row.get("tenant")?, parsed(row.get("id")?)?))).collect()
     }
 
-    /// Sets what a tenant may do: jobs running at the same time, and how long ended jobs are kept, ms. `None` lifts
-    /// the bound. Makes the tenant if it is new.
-    ///
-    /// # Errors
-    /// The database's.
-    pub async fn set_tenant(&self, tenant: &str, max_running: Option<i64>, keep_ms: Option<i64>) -> sqlx::Result<()> {
-        let sql = "INSERT INTO tenant (id, name, max_running, retention_ms, created_at) VALUES ($1, $1, $2, $3, now_ms()) \
-                   ON CONFLICT (id) DO UPDATE SET max_running = excluded.max_running, retention_ms = excluded.retention_ms";
-        self.db().run(Scope::System, sql, args![tenant, max_running, keep_ms]).await?;
-        Ok(())
-    }
-
     /// Writes a worker into the roll, or renews its line; forgets those that went without a word.
     ///
     /// # Errors
