@@ -20,6 +20,7 @@ mod uploads;
 mod webhooks;
 mod workers;
 
+pub(crate) use health::disk_free;
 pub(crate) use listen::listen;
 
 use crate::state::State;
