@@ -78,7 +78,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
             .env("VASCULUM_BIN", binary)
             .env("VASCULUM_OUT", &out)
             .env("VASCULUM_SCAN", &scan)
-            .env("SURFACES", &surfaces);
+            .env("SURFACES", &surfaces)
+            .env("VASCULUM_S3S", tools::s3()?);
         shell::run(judge)?;
     }
     let node = tools::node_packages()?;
