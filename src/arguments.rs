@@ -89,6 +89,9 @@ pub(crate) struct Serve {
     /// A series that is sent by DICOMweb is run when nothing more of it has come for this long, seconds.
     #[arg(long, default_value_t = 30, env = "VASCULUM_STOW_QUIET_SECONDS")]
     pub(crate) stow_quiet_seconds: u64,
+    /// A collector of traces (OTLP over HTTP), such as http://127.0.0.1:4318.
+    #[arg(long, env = "VASCULUM_OTLP_ENDPOINT")]
+    pub(crate) otlp_endpoint: Option<String>,
     /// A host to which webhooks may go though its network is not public; may be given several times.
     #[arg(long = "webhook-host")]
     pub(crate) webhook_hosts: Vec<String>,

@@ -146,6 +146,7 @@ fn config(a: Serve) -> Config {
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
+        otlp_endpoint: a.otlp_endpoint,
         stow_quiet_seconds: a.stow_quiet_seconds,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
         oidc: oidc(a.oidc),

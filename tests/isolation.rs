@@ -11,6 +11,7 @@ use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
+const TRACE: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
 const BINARY: &str = env!("CARGO_BIN_EXE_vasculum");
 
 struct Server(Child);
@@ -49,7 +50,9 @@ async fn sent(client: &reqwest::Client, address: &str, scan: &Path) -> String {
         let name = path.file_name().unwrap().to_string_lossy().into_owned();
         form = form.part("input", reqwest::multipart::Part::bytes(fs::read(&path).unwrap()).file_name(name));
     }
-    let answer = client.post(format!("{address}/v1/jobs")).multipart(form).send().await.unwrap();
+    let request =
+        client.post(format!("{address}/v1/jobs")).header("traceparent", format!("00-{TRACE}-00f067aa0ba902b7-01"));
+    let answer = request.multipart(form).send().await.unwrap();
     assert_eq!(answer.status(), 202);
     answer.headers()["location"].to_str().unwrap().to_owned()
 }
@@ -107,6 +110,7 @@ async fn looked_at(command: impl FnOnce(&mut Command)) {
     let mut names: Vec<&str> = environment.split_terminator('\0').map(|pair| pair.split('=').next().unwrap()).collect();
     names.sort_unstable();
     assert_eq!(names, ["TMPDIR", "VASCULUM_TRACE_ID"]);
+    assert!(environment.contains(TRACE), "the request's trace goes on in the job: {environment}");
     for descriptor in fs::read_dir(process.join("fd")).unwrap().flatten() {
         let open = fs::read_link(descriptor.path()).unwrap_or_default();
         assert!(!open.to_string_lossy().starts_with("socket:"), "the job holds a socket of the server's");

@@ -117,6 +117,8 @@ pub struct Config {
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
     /// again (503). At least `max_body`. Default 4 GiB.
     pub upload_memory: u64,
+    /// A collector of traces (OTLP over HTTP), such as `http://127.0.0.1:4318`. Default none.
+    pub otlp_endpoint: Option<String>,
     /// `/readyz` says no when the data folder's disk has less than this, bytes. Default 256 MiB.
     pub min_free_disk: u64,
     /// Reads an upload. Default: takes the files as they are; the binary wires `artefact::read::intake`.
@@ -151,6 +153,7 @@ impl Default for Config {
             executable_args: Vec::new(),
             max_body: 2 << 30,
             upload_memory: 4 << 30,
+            otlp_endpoint: None,
             min_free_disk: 256 << 20,
             intake: Ok,
             receive: crate::intake::no_instance,

@@ -21,6 +21,7 @@ pub mod state;
 pub mod store;
 pub mod telemetry;
 pub mod tls;
+pub mod traces;
 mod uploads;
 pub mod webhooks;
 pub mod worker;

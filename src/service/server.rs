@@ -10,6 +10,7 @@ use crate::state::{State, UPLOAD_UNIT};
 use crate::store::Store;
 use crate::telemetry;
 use crate::tls::Identity;
+use crate::traces::Traces;
 use crate::worker::{Heartbeat, Isolation, Memory, Owner, Worker};
 use anyhow::{Context as _, bail};
 use std::fs::{File, TryLockError};
@@ -69,7 +70,13 @@ impl Server {
             Auth::Required => auth::first_key(parts.queue.db()).await?,
             Auth::None => None,
         };
-        let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+        let (traces, carrier) = Traces::new(config.otlp_endpoint.as_deref(), shutdown.clone())?;
+        tasks.spawn(async move {
+            if let Some(carrier) = carrier {
+                carrier.await
+            }
+        });
+        let worker = parts.work(&config, &traces, &shutdown, &mut tasks).await?;
         tasks.spawn(keeping::keep(
             parts.queue.clone(),
             parts.store.clone(),
@@ -88,6 +95,7 @@ impl Server {
             provider,
             shutdown: shutdown.clone(),
             metrics: telemetry::recorder(),
+            traces,
             address,
         };
         let db = state.queue.db().clone();
@@ -144,6 +152,7 @@ impl Parts {
     async fn work(
         &self,
         config: &Arc<Config>,
+        traces: &Traces,
         shutdown: &CancellationToken,
         tasks: &mut JoinSet<()>,
     ) -> anyhow::Result<Option<Arc<Worker>>> {
@@ -165,6 +174,7 @@ impl Parts {
             owner,
             memory: Memory::new(config.memory_mb, config.workers),
             isolation: Isolation::default(),
+            traces: traces.clone(),
             shutdown: shutdown.clone(),
         });
         tasks.spawn(Arc::clone(&worker).roll());
@@ -225,7 +235,13 @@ pub async fn work(config: Config) -> anyhow::Result<()> {
     let parts = Parts::open(&config).await?;
     let shutdown = CancellationToken::new();
     let mut tasks = JoinSet::new();
-    let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+    let (traces, carrier) = Traces::new(config.otlp_endpoint.as_deref(), shutdown.clone())?;
+    tasks.spawn(async move {
+        if let Some(carrier) = carrier {
+            carrier.await
+        }
+    });
+    let worker = parts.work(&config, &traces, &shutdown, &mut tasks).await?;
     tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
     say(&format!("working on {} jobs at a time", config.workers))?;
     stop_signal().await?;

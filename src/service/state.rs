@@ -6,6 +6,7 @@ use crate::config::Config;
 use crate::error::Problem;
 use crate::queue::Queue;
 use crate::store::Store;
+use crate::traces::Traces;
 use crate::worker::Worker;
 use metrics_exporter_prometheus::PrometheusHandle;
 use std::net::SocketAddr;
@@ -35,6 +36,8 @@ pub struct State {
     pub shutdown: CancellationToken,
     /// Renders /metrics.
     pub metrics: PrometheusHandle,
+    /// Where traces go.
+    pub traces: Traces,
     /// The address really listened on.
     pub address: SocketAddr,
 }

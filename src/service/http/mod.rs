@@ -115,6 +115,6 @@ pub(crate) fn router(state: State) -> Router {
         .layer(from_fn(guard::plain))
         .layer(from_fn_with_state(state.clone(), guard::host))
         .layer(from_fn_with_state(state.clone(), guard::headers))
-        .layer(from_fn(problems::layer))
+        .layer(from_fn_with_state(state.clone(), problems::layer))
         .with_state(state)
 }
