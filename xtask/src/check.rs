@@ -70,6 +70,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     let python = tools::python()?;
     tools::deploy()?;
     tools::pacs()?;
+    tools::strace()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge

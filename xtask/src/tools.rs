@@ -108,6 +108,14 @@ pub(crate) fn deploy() -> Result<()> {
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
 }
 
+/// What writes down every write and sync of a process.
+pub(crate) fn strace() -> Result<()> {
+    if shell::has("strace") {
+        return Ok(());
+    }
+    apt("strace (the database's file is looked at after each of its syncs)", &["strace"])
+}
+
 /// A PACS that sends by DICOMweb, and what feeds it. The package's own service is of no use here.
 pub(crate) fn pacs() -> Result<()> {
     if PathBuf::from("/usr/sbin/Orthanc").exists() && shell::has("storescu") {
