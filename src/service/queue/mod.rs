@@ -24,7 +24,8 @@ pub use read::{Counts, Page};
 pub use submit::{NewJob, Submitted};
 pub use types::{ArtefactRow, EventRow, JobRow, JobState};
 
-use crate::db::Db;
+use crate::db::{Db, Together};
+use std::sync::Arc;
 use tokio::sync::{broadcast, mpsc};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
@@ -46,18 +47,21 @@ pub struct Queue {
     db: Db,
     hints: broadcast::Sender<Uuid>,
     told: broadcast::Sender<Uuid>,
+    /// Callers that ask for single jobs at the same time, by tenant and id.
+    asked: Arc<Together<(String, String), JobRow>>,
 }
 
 impl Queue {
     /// A queue over an open database.
     pub fn new(db: Db) -> Self {
-        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS) }
+        let asked = Arc::default();
+        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS), asked }
     }
 
     /// The same table and hints through another connection (the heartbeat thread has its own).
     #[must_use]
     pub fn with_db(&self, db: Db) -> Self {
-        Self { db, hints: self.hints.clone(), told: self.told.clone() }
+        Self { db, hints: self.hints.clone(), told: self.told.clone(), asked: Arc::default() }
     }
 
     /// The database under it.
