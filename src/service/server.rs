@@ -92,6 +92,7 @@ impl Server {
             queue: parts.queue,
             store: parts.store,
             worker,
+            callers: Arc::default(),
             provider,
             shutdown: shutdown.clone(),
             metrics: telemetry::recorder(),

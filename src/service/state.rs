@@ -1,7 +1,7 @@
 //! What every request handler shares.
 
 use crate::audit::{self, Entry};
-use crate::auth::{Principal, Provider};
+use crate::auth::{Callers, Principal, Provider};
 use crate::config::Config;
 use crate::error::Problem;
 use crate::queue::Queue;
@@ -28,6 +28,8 @@ pub struct State {
     pub store: Store,
     /// The workers of this process, if any.
     pub worker: Option<Arc<Worker>>,
+    /// Callers whose keys are looked up at the same time.
+    pub(crate) callers: Arc<Callers>,
     /// Who checks bearer tokens that are no API keys.
     pub provider: Option<Arc<Provider>>,
     /// Memory for uploads, in units of [`UPLOAD_UNIT`].

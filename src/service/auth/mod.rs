@@ -14,7 +14,7 @@ pub mod tenants;
 pub use oidc::Provider;
 
 use crate::config::Auth;
-use crate::db::{Db, Scope, args};
+use crate::db::{Db, MOST, Scope, Together, Value, args};
 use crate::error::Problem;
 use crate::state::State;
 use crate::store::hex;
@@ -22,6 +22,7 @@ use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode, header};
 use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
 use uuid::Uuid;
 
 /// Begins every API key.
@@ -121,24 +122,54 @@ fn digest(key: &str) -> Vec<u8> {
     Sha256::digest(key.as_bytes()).to_vec()
 }
 
+/// A key's row.
+#[derive(Clone, Debug)]
+pub(crate) struct Found {
+    id: String,
+    tenant: String,
+    role: String,
+    max_bytes: Option<i64>,
+    requests_per_minute: Option<i64>,
+}
+
+/// Callers whose keys are looked up at the same time, by digest.
+pub(crate) type Callers = Together<Vec<u8>, Found>;
+
 /// The principal of a key, or a 401.
-///
-/// # Errors
-/// `auth.key` when the key is unknown or revoked; the database's.
-pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
-    let sql =
-        "SELECT id, tenant, role, max_bytes, requests_per_minute FROM api_key WHERE digest = $1 AND revoked_at IS NULL";
-    let row = db.row(Scope::System, sql, args![digest(key)]).await?;
-    let Some(row) = row else {
+async fn principal(state: &State, key: &str) -> Result<Principal, Problem> {
+    let found = state.callers.row(digest(key), |_, _| true, |digests| found(state.queue.db(), digests)).await?;
+    let Some(found) = found else {
         return Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one."));
     };
-    let role = Role::of(row.get("role")?).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
-    let max_bytes = row.get::<Option<i64>>("max_bytes")?.and_then(|n| u64::try_from(n).ok());
-    let id: String = row.get("id")?;
-    if let Some(most) = row.get::<Option<i64>>("requests_per_minute")? {
-        pace::count(&id, most)?;
+    let role = Role::of(&found.role).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
+    if let Some(most) = found.requests_per_minute {
+        pace::count(&found.id, most)?;
     }
-    Ok(Principal { tenant: row.get("tenant")?, role, actor: id, max_bytes })
+    let max_bytes = found.max_bytes.and_then(|n| u64::try_from(n).ok());
+    Ok(Principal { tenant: found.tenant, role, actor: found.id, max_bytes })
+}
+
+const KEYS: &str = "SELECT id, tenant, role, max_bytes, requests_per_minute, digest FROM api_key \
+    WHERE revoked_at IS NULL AND digest IN ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, \
+    $18, $19, $20, $21, $22, $23, $24, $25, $26, $27, $28, $29, $30, $31, $32)";
+
+/// Keys that count, by digest.
+async fn found(db: &Db, digests: Vec<Vec<u8>>) -> sqlx::Result<BTreeMap<Vec<u8>, Found>> {
+    let Some(last) = digests.last().cloned() else { return Ok(BTreeMap::new()) };
+    let mut values: Vec<Value> = digests.into_iter().map(Value::from).collect();
+    values.resize(MOST, Value::from(last));
+    let rows = db.rows(Scope::System, KEYS, values).await?;
+    let read = |row: &crate::db::Row| {
+        let found = Found {
+            id: row.get("id")?,
+            tenant: row.get("tenant")?,
+            role: row.get("role")?,
+            max_bytes: row.get("max_bytes")?,
+            requests_per_minute: row.get("requests_per_minute")?,
+        };
+        Ok((row.get("digest")?, found))
+    };
+    rows.iter().map(read).collect()
 }
 
 /// The caller of an API key or of a token.
@@ -148,7 +179,7 @@ pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
 pub async fn known(state: &State, secret: &str) -> Result<Principal, Problem> {
     match &state.provider {
         Some(provider) if !secret.starts_with(KEY_PREFIX) => provider.principal(state.queue.db(), secret).await,
-        _ => principal(state.queue.db(), secret).await,
+        _ => principal(state, secret).await,
     }
 }
 
