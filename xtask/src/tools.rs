@@ -108,6 +108,14 @@ pub(crate) fn deploy() -> Result<()> {
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
 }
 
+/// What asks a service as often as it can.
+pub(crate) fn wrk() -> Result<()> {
+    if shell::has("wrk") {
+        return Ok(());
+    }
+    apt("wrk (it measures the rate of requests)", &["wrk"])
+}
+
 /// What writes down every write and sync of a process.
 pub(crate) fn strace() -> Result<()> {
     if shell::has("strace") {
