@@ -3,14 +3,17 @@
 # names them, so a copy of the store made after that of the database holds everything the database names.
 # Usage: backup.sh DATA_DIR BACKUP_DIR        (SQLite and a local store; the service may run)
 #        VASCULUM_DATABASE_URL=postgres://... backup.sh DATA_DIR BACKUP_DIR   (pg_dump instead)
-# Restore: stop the service; copy BACKUP_DIR/vasculum.sqlite and BACKUP_DIR/store into an empty data folder (or
-# `pg_restore --dbname URL BACKUP_DIR/vasculum.dump`); start it; `vasculum verify-audit`. Jobs that ran are taken back.
+# Restore: restore.sh beside this file.
 set -eu
 data=$1
 backup=$2
 mkdir -p "$backup"
 case "${VASCULUM_DATABASE_URL:-}" in
-postgres*) pg_dump --format=custom --file="$backup/vasculum.dump" "$VASCULUM_DATABASE_URL" ;;
+# Row level security binds the service's own role too: it sees every row as the tenant `*` alone.
+postgres*)
+    PGOPTIONS="-c vasculum.tenant=*" pg_dump --enable-row-security --format=custom \
+        --file="$backup/vasculum.dump" "$VASCULUM_DATABASE_URL"
+    ;;
 *) vasculum backup --data-dir "$data" --out "$backup/vasculum.sqlite" ;;
 esac
 if [ -d "$data/store" ]; then

@@ -36,6 +36,8 @@ pub(crate) enum Command {
     Backup(Backup),
     /// API keys.
     Key(Key),
+    /// Tenants: what they may do and how long their jobs are kept.
+    Tenant(Tenant),
     /// Check that no line of the audit was changed, moved or taken out.
     VerifyAudit(VerifyAudit),
     /// Print the API's description (OpenAPI 3.1, YAML).
@@ -68,6 +70,12 @@ pub(crate) struct Serve {
     /// Address of the API and the portal; port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:8080", env = "VASCULUM_LISTEN")]
     pub(crate) listen: SocketAddr,
+    /// Certificate of the listener with its chain, PEM; read again when it changes or on SIGHUP. Plain HTTP without.
+    #[arg(long, env = "VASCULUM_TLS_CERT", requires = "tls_key")]
+    pub(crate) tls_cert: Option<PathBuf>,
+    /// The certificate's private key, PEM.
+    #[arg(long, env = "VASCULUM_TLS_KEY", requires = "tls_cert")]
+    pub(crate) tls_key: Option<PathBuf>,
     /// Jobs at the same time.
     #[arg(long, default_value_t = 1)]
     pub(crate) workers: usize,
@@ -80,6 +88,12 @@ pub(crate) struct Serve {
     /// Longest time of one job, seconds; 0: no bound.
     #[arg(long, default_value_t = 21_600)]
     pub(crate) job_seconds: u64,
+    /// A series that is sent by DICOMweb is run when nothing more of it has come for this long, seconds.
+    #[arg(long, default_value_t = 30, env = "VASCULUM_STOW_QUIET_SECONDS")]
+    pub(crate) stow_quiet_seconds: u64,
+    /// A collector of traces (OTLP over HTTP), such as http://127.0.0.1:4318.
+    #[arg(long, env = "VASCULUM_OTLP_ENDPOINT")]
+    pub(crate) otlp_endpoint: Option<String>,
     /// A host to which webhooks may go though its network is not public; may be given several times.
     #[arg(long = "webhook-host")]
     pub(crate) webhook_hosts: Vec<String>,
@@ -89,6 +103,28 @@ pub(crate) struct Serve {
     /// No API keys: only on a loopback address.
     #[arg(long)]
     pub(crate) no_auth: bool,
+    #[command(flatten)]
+    pub(crate) oidc: OidcArgs,
+}
+
+/// An identity provider (OpenID Connect) whose bearer tokens count beside API keys.
+#[derive(Args)]
+pub(crate) struct OidcArgs {
+    /// `iss` of the identity provider's tokens; with it, bearer tokens count beside API keys.
+    #[arg(long, env = "VASCULUM_OIDC_ISSUER", requires_all = ["oidc_audience", "oidc_jwks_url"])]
+    pub(crate) oidc_issuer: Option<String>,
+    /// `aud` that a token for this service carries.
+    #[arg(long, env = "VASCULUM_OIDC_AUDIENCE", requires = "oidc_issuer")]
+    pub(crate) oidc_audience: Option<String>,
+    /// Where the provider's public keys are (JSON Web Key Set); https, or http on this machine.
+    #[arg(long, env = "VASCULUM_OIDC_JWKS_URL", requires = "oidc_issuer")]
+    pub(crate) oidc_jwks_url: Option<String>,
+    /// Claim that names the tenant (which must exist); dots lead into objects.
+    #[arg(long, env = "VASCULUM_OIDC_TENANT_CLAIM", default_value = "tenant")]
+    pub(crate) oidc_tenant_claim: String,
+    /// Claim that names the role (upload, read, admin, auditor), or a list of which the strongest counts.
+    #[arg(long, env = "VASCULUM_OIDC_ROLE_CLAIM", default_value = "role")]
+    pub(crate) oidc_role_claim: String,
 }
 
 #[derive(Args)]
@@ -130,6 +166,34 @@ pub(crate) enum KeyAction {
         data: Data,
         /// The key's id, from the list.
         id: String,
+    },
+}
+
+#[derive(Args)]
+pub(crate) struct Tenant {
+    #[command(subcommand)]
+    pub(crate) action: TenantAction,
+}
+
+#[derive(Subcommand)]
+pub(crate) enum TenantAction {
+    /// Set a tenant's bounds; made if it is new. What is not given is lifted.
+    Set {
+        #[command(flatten)]
+        data: Data,
+        /// The tenant.
+        name: String,
+        /// Its jobs that may run at the same time.
+        #[arg(long, value_parser = clap::value_parser!(i64).range(1..))]
+        max_running: Option<i64>,
+        /// Days after which an ended job erases itself.
+        #[arg(long, value_parser = clap::value_parser!(i64).range(1..=36_500))]
+        keep_days: Option<i64>,
+    },
+    /// List every tenant with its bounds.
+    List {
+        #[command(flatten)]
+        data: Data,
     },
 }
 

@@ -62,6 +62,7 @@ fn write_pixels(path: &Path, read: &pipeline::Understood) -> Result<(), Failure>
 /// One job of a worker: progress as JSON lines on standard output; ends when standard input closes, so that a killed
 /// worker leaves no job running.
 pub(crate) fn exec(a: &ExecJob) -> ExitCode {
+    line(&json!({"isolation": crate::isolation::leave_network()}));
     let outcome = plan_of(Some(&a.plan)).and_then(|plan| {
         let ctx = context(Some(a.threads))?;
         die_with_parent();

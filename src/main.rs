@@ -3,6 +3,7 @@
 mod arguments;
 mod cohorts;
 mod demo;
+mod isolation;
 mod jobs;
 mod phantoms;
 mod serving;
@@ -28,6 +29,7 @@ fn main() -> ExitCode {
         Command::Migrate(a) => serving::migrate(a),
         Command::Backup(a) => serving::backup(a),
         Command::Key(a) => serving::key(a),
+        Command::Tenant(a) => serving::tenant(a),
         Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),
         Command::Openapi => serving::openapi(),

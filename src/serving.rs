@@ -1,11 +1,11 @@
-//! `serve`, `work`, `migrate`, `key`, `openapi`.
+//! `serve`, `work`, `migrate`, `key`, `tenant`, `openapi`.
 
-use crate::arguments::{Backup, Data, Key, KeyAction, Serve, VerifyAudit};
+use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, Tenant, TenantAction, VerifyAudit};
 use artefact::read::{Limits, NamedBytes};
 use artefact::write;
 use serde_json::Value;
-use service::auth::{Role, keys, keys::NewKey};
-use service::{Auth, Config, Problem, audit};
+use service::auth::{Role, keys, keys::NewKey, tenants};
+use service::{Auth, Config, Instance, Oidc, Problem, Tls, audit};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -66,6 +66,31 @@ pub(crate) fn key(a: Key) -> ExitCode {
     })
 }
 
+/// Set or list tenants.
+pub(crate) fn tenant(a: Tenant) -> ExitCode {
+    with_runtime(async move {
+        match a.action {
+            TenantAction::Set { data, name, max_running, keep_days } => {
+                let db = service::open_database(&data_config(data)).await?;
+                let keep_ms = keep_days.map(|days| days * 86_400_000);
+                tenants::set(&db, &name, max_running, keep_ms).await?;
+                db.close().await;
+            }
+            TenantAction::List { data } => {
+                let db = service::open_database(&data_config(data)).await?;
+                println!("{:<24}{:>12}{:>12}", "tenant", "max running", "kept, days");
+                let shown = |bound: Option<i64>| bound.map_or_else(|| "-".to_owned(), |n| n.to_string());
+                for row in tenants::list(&db).await? {
+                    let days = row.keep_ms.map(|ms| ms / 86_400_000);
+                    println!("{:<24}{:>12}{:>12}", row.id, shown(row.max_running), shown(days));
+                }
+                db.close().await;
+            }
+        }
+        Ok(())
+    })
+}
+
 /// Check the audit's chain, and print it as FHIR AuditEvent resources if wanted.
 pub(crate) fn verify_audit(a: VerifyAudit) -> ExitCode {
     with_runtime(async move {
@@ -108,6 +133,7 @@ fn data_config(a: Data) -> Config {
             .filter_map(|(name, value)| Some((name.strip_prefix("VASCULUM_S3_")?.to_owned(), value)))
             .collect(),
         intake,
+        receive,
         check_plan,
         check_scan,
         ..Config::default()
@@ -117,21 +143,43 @@ fn data_config(a: Data) -> Config {
 fn config(a: Serve) -> Config {
     Config {
         listen: a.listen,
+        tls: a.tls_cert.zip(a.tls_key).map(|(cert, key)| Tls { cert, key }),
         workers: a.workers,
         threads: a.threads.unwrap_or(0),
         memory_mb: a.memory_mb,
         job_seconds: a.job_seconds,
         webhook_hosts: a.webhook_hosts,
         frame_ancestors: a.frame_ancestors,
+        otlp_endpoint: a.otlp_endpoint,
+        stow_quiet_seconds: a.stow_quiet_seconds,
         auth: if a.no_auth { Auth::None } else { Auth::Required },
+        oidc: oidc(a.oidc),
         ..data_config(a.data)
     }
+}
+
+fn oidc(a: OidcArgs) -> Option<Oidc> {
+    Some(Oidc {
+        issuer: a.oidc_issuer?,
+        audience: a.oidc_audience?,
+        jwks_url: a.oidc_jwks_url?,
+        tenant_claim: a.oidc_tenant_claim,
+        role_claim: a.oidc_role_claim,
+        ..Oidc::default()
+    })
 }
 
 fn intake(files: Vec<(String, Vec<u8>)>) -> Result<Vec<(String, Vec<u8>)>, Problem> {
     let files = files.into_iter().map(|(name, bytes)| NamedBytes { name, bytes }).collect();
     let taken = artefact::read::intake(files, &Limits::default()).map_err(|e| Problem::from_fault(&e))?;
     Ok(taken.into_iter().map(|f| (f.name, f.bytes)).collect())
+}
+
+fn receive(bytes: &[u8]) -> Instance {
+    let (names, file) = artefact::read::instance(bytes, &Limits::default());
+    let file = file.and_then(|file| file.ok_or(artefact::read::Error::NoImages { files: 1 }));
+    let file = file.map_err(|e| Problem::from_fault(&e));
+    Instance { class: names.class, instance: names.instance, study: names.study, series: names.series, file }
 }
 
 fn check_plan(bytes: &[u8]) -> Result<(), Problem> {

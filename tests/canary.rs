@@ -33,6 +33,7 @@ impl Server {
         fs::create_dir(folder.path().join("tmp")).unwrap();
         let log = fs::File::create(folder.path().join("log")).unwrap();
         let (process, address) = serving::serve(&folder.path().join("data"), |command| {
+            command.args(["--stow-quiet-seconds", "0"]);
             command.env("RUST_LOG", "trace").env("TMPDIR", folder.path().join("tmp")).stderr(log);
         });
         Self { process, address, folder }
@@ -166,6 +167,19 @@ async fn send(server: &Server, files: Vec<(String, Vec<u8>)>, plan: &str) -> (u1
     (answer.status().as_u16(), answer.text().await.unwrap())
 }
 
+/// The same files over DICOMweb; the names of files come as a header that senders give.
+async fn stow(server: &Server, files: &[(String, Vec<u8>)]) -> reqwest::Response {
+    let mut body = Vec::new();
+    for (name, bytes) in files {
+        let head = format!("--edge\r\nContent-Type: application/dicom\r\nContent-Location: {name}\r\n\r\n");
+        body.extend([head.as_bytes(), bytes, b"\r\n"].concat());
+    }
+    body.extend(b"--edge--\r\n");
+    let kind = "multipart/related; type=\"application/dicom\"; boundary=edge";
+    let request = reqwest::Client::new().post(format!("{}/dicomweb/studies", server.address));
+    request.header("content-type", kind).body(body).send().await.unwrap()
+}
+
 async fn get(server: &Server, path: &str) -> Vec<u8> {
     let answer = reqwest::get(format!("{}{path}", server.address)).await.unwrap();
     answer.bytes().await.unwrap().to_vec()
@@ -216,6 +230,20 @@ async fn a_patients_name_is_found_nowhere() {
             told.push(get(&server, &format!("/v1/jobs/{id}{path}")).await);
         }
     }
+    // The same over DICOMweb.
+    let sent = stow(&server, &scan).await;
+    assert_eq!(sent.status(), 200);
+    let job = sent.headers()["location"].to_str().unwrap().to_owned();
+    let answer: Value = serde_json::from_str(&sent.text().await.unwrap()).unwrap();
+    told.push(followed(&server, job.rsplit('/').next().unwrap()).await.to_string().into_bytes());
+    told.push(get(&server, &format!("{job}/result")).await);
+    // The UIDs go back to their sender and are kept nowhere.
+    let uid = answer["00081199"]["Value"][0]["00081155"]["Value"][0].as_str().unwrap();
+    assert!(holds(&scan[0].1, uid), "{answer}");
+    for path in files(server.folder.path()) {
+        assert!(!holds(&fs::read(&path).unwrap_or_default(), uid), "{uid} is in {}", path.display());
+    }
+    told.push(answer.to_string().into_bytes());
     // Uploads that are refused: their content is not told, their file's name only to their sender.
     let mut cut = scan.clone();
     let half = cut[5].1.len() / 2;
@@ -225,6 +253,9 @@ async fn a_patients_name_is_found_nowhere() {
     burned[0].1.splice(at..at, element(0x0028_0301, "CS", b"YES"));
     let text = format!("{NAME} was here, {NAME} was not");
     let broken_plan = format!("{{\"roles\": {{\"{NAME}\": 1}}}}");
+    let unread = stow(&server, &burned).await;
+    assert_eq!(unread.status(), 202);
+    told.push(unread.bytes().await.unwrap().to_vec());
     let refused = [
         (cut, "{}".to_owned()),
         (burned, "{}".to_owned()),

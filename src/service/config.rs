@@ -2,6 +2,7 @@
 //! reads either.
 
 use crate::error::Problem;
+use crate::tls::Tls;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -11,6 +12,24 @@ pub type NamedBytes = (String, Vec<u8>);
 /// Reads an upload before anything touches disk: unpacks archives within limits, de-identifies DICOM, refuses what
 /// cannot be read. Runs on a blocking thread.
 pub type Intake = fn(Vec<NamedBytes>) -> Result<Vec<NamedBytes>, Problem>;
+
+/// A DICOM instance as it was received: its names for the answer to its sender, and the file to keep.
+#[derive(Clone, Debug)]
+pub struct Instance {
+    /// SOPClassUID.
+    pub class: String,
+    /// SOPInstanceUID.
+    pub instance: String,
+    /// StudyInstanceUID.
+    pub study: String,
+    /// SeriesInstanceUID.
+    pub series: String,
+    /// The de-identified file, or why it is not taken.
+    pub file: Result<Vec<u8>, Problem>,
+}
+
+/// Reads one DICOM instance, de-identifies it. Runs on a blocking thread.
+pub type Receive = fn(&[u8]) -> Instance;
 
 /// Checks the bytes of a plan; every fault at once.
 pub type CheckPlan = fn(&[u8]) -> Result<(), Problem>;
@@ -27,6 +46,36 @@ pub enum Auth {
     None,
 }
 
+/// An identity provider whose bearer tokens count beside API keys.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Oidc {
+    /// `iss` of its tokens.
+    pub issuer: String,
+    /// `aud` that a token for this service carries.
+    pub audience: String,
+    /// Where its public keys are (JSON Web Key Set).
+    pub jwks_url: String,
+    /// Claim that names the tenant; dots lead into objects. Default `tenant`.
+    pub tenant_claim: String,
+    /// Claim that names the role, or a list of roles. Default `role`.
+    pub role_claim: String,
+    /// The keys are not fetched more often than this for a key that is not known, seconds. Default 60.
+    pub refresh_seconds: u64,
+}
+
+impl Default for Oidc {
+    fn default() -> Self {
+        Self {
+            issuer: String::new(),
+            audience: String::new(),
+            jwks_url: String::new(),
+            tenant_claim: "tenant".to_owned(),
+            role_claim: "role".to_owned(),
+            refresh_seconds: 60,
+        }
+    }
+}
+
 /// Settings of the service. `Default` gives one machine: SQLite and a local folder, loopback, keys required.
 #[derive(Clone, Debug)]
 pub struct Config {
@@ -35,6 +84,8 @@ pub struct Config {
     /// Address to listen on; port 0 takes a free one, printed and written to `<data_dir>/listen`.
     /// Default 127.0.0.1:8080.
     pub listen: SocketAddr,
+    /// Certificate of the listener; without one it speaks plain HTTP. Default none.
+    pub tls: Option<Tls>,
     /// `sqlite:PATH` or `postgres://USER:PASSWORD@HOST/DATABASE`; default `sqlite:<data_dir>/vasculum.sqlite`.
     pub database_url: Option<String>,
     /// Connections to PostgreSQL that this process may hold (plus one for beats and one for hints). Default 8.
@@ -54,6 +105,8 @@ pub struct Config {
     pub job_seconds: u64,
     /// Who may call. Default [`Auth::Required`].
     pub auth: Auth,
+    /// An identity provider whose tokens count too. Default none.
+    pub oidc: Option<Oidc>,
     /// The program whose `exec-job` sub-command runs one job. Default: this program.
     pub executable: PathBuf,
     /// Arguments put before `exec-job` (none by default; an interpreter's script in tests).
@@ -69,10 +122,16 @@ pub struct Config {
     /// Bytes of uploads held in memory at the same time over all requests, beyond which a new one is asked to come
     /// again (503). At least `max_body`. Default 4 GiB.
     pub upload_memory: u64,
+    /// A collector of traces (OTLP over HTTP), such as `http://127.0.0.1:4318`. Default none.
+    pub otlp_endpoint: Option<String>,
     /// `/readyz` says no when the data folder's disk has less than this, bytes. Default 256 MiB.
     pub min_free_disk: u64,
     /// Reads an upload. Default: takes the files as they are; the binary wires `artefact::read::intake`.
     pub intake: Intake,
+    /// Reads a DICOM instance of DICOMweb. Default: takes none; the binary wires `artefact::read::instance`.
+    pub receive: Receive,
+    /// A series that comes over DICOMweb is run when nothing more of it has come for this long, seconds. Default 30.
+    pub stow_quiet_seconds: u64,
     /// Checks a plan. Default: any JSON object; the binary wires the artefact crate's reader.
     pub check_plan: CheckPlan,
     /// Reads a scan for `?validate=true`. Default: null; the binary wires the pipeline's reader.
@@ -84,6 +143,7 @@ impl Default for Config {
         Self {
             data_dir: PathBuf::from("vasculum-data"),
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            tls: None,
             database_url: None,
             database_connections: 8,
             store_url: None,
@@ -96,12 +156,16 @@ impl Default for Config {
             workers: 1,
             threads: 0,
             auth: Auth::Required,
+            oidc: None,
             executable: std::env::current_exe().unwrap_or_else(|_| PathBuf::from("vasculum")),
             executable_args: Vec::new(),
             max_body: 2 << 30,
             upload_memory: 4 << 30,
+            otlp_endpoint: None,
             min_free_disk: 256 << 20,
             intake: Ok,
+            receive: crate::intake::no_instance,
+            stow_quiet_seconds: 30,
             check_plan: crate::intake::json_object,
             check_scan: |_, _| Ok(serde_json::Value::Null),
         }

@@ -3,7 +3,7 @@
 //! Everything here works on memory: names are made harmless and bytes de-identified before the first write, because
 //! a file name, too, may carry a patient's. The heavy reading runs on a blocking thread, never on an async worker.
 
-use crate::config::{Config, NamedBytes};
+use crate::config::{Config, Instance, NamedBytes};
 use crate::error::Problem;
 use axum::http::StatusCode;
 use std::collections::BTreeSet;
@@ -36,6 +36,13 @@ fn empty() -> Problem {
         "upload.empty",
         "The upload holds no file. Send one or more parts named `input`: a zip, DICOM files, a volume or slices.",
     )
+}
+
+/// Takes no DICOM instance: the reader of a service that was given none.
+pub fn no_instance(_bytes: &[u8]) -> Instance {
+    let none = Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", "This service reads no DICOM instances.");
+    let [class, instance, study, series] = Default::default();
+    Instance { class, instance, study, series, file: Err(none) }
 }
 
 /// Whether `bytes` are a JSON object: the least that any plan must be.

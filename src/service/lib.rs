@@ -21,13 +21,15 @@ pub mod state;
 pub mod store;
 pub mod telemetry;
 pub mod tls;
+pub mod traces;
 mod uploads;
 pub mod webhooks;
 pub mod worker;
 
-pub use config::{Auth, CheckPlan, Config, Intake, NamedBytes};
+pub use config::{Auth, CheckPlan, Config, Instance, Intake, NamedBytes, Oidc, Receive};
 pub use error::{PROBLEM_JSON, Problem, place_json};
 pub use server::{Server, migrate, open_database, serve, work};
+pub use tls::Tls;
 
 /// The OpenAPI 3.1 document as YAML; the same bytes for the same version.
 pub fn openapi() -> String {

@@ -9,7 +9,9 @@ use crate::queue::Queue;
 use crate::state::{State, UPLOAD_UNIT};
 use crate::store::Store;
 use crate::telemetry;
-use crate::worker::{Heartbeat, Memory, Owner, Worker};
+use crate::tls::Identity;
+use crate::traces::Traces;
+use crate::worker::{Heartbeat, Isolation, Memory, Owner, Worker};
 use anyhow::{Context as _, bail};
 use std::fs::{File, TryLockError};
 use std::net::SocketAddr;
@@ -28,6 +30,7 @@ const FAREWELL: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
+    scheme: &'static str,
     first_key: Option<String>,
     shutdown: CancellationToken,
     tasks: JoinSet<()>,
@@ -54,6 +57,8 @@ impl Server {
             !config.is_shared() || config.workers == 0 || config.store_url.is_some(),
             "workers of several machines need one store: give --store-url with PostgreSQL (or --workers 0)"
         );
+        let provider = config.oidc.as_ref().map(auth::Provider::new).transpose()?.map(Arc::new);
+        let identity = config.tls.as_ref().map(Identity::read).transpose()?.map(Arc::new);
         let lock = lock(&config.data_dir)?;
         let listener =
             TcpListener::bind(config.listen).await.with_context(|| format!("cannot listen on {}", config.listen))?;
@@ -65,7 +70,13 @@ impl Server {
             Auth::Required => auth::first_key(parts.queue.db()).await?,
             Auth::None => None,
         };
-        let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+        let (traces, carrier) = Traces::new(config.otlp_endpoint.as_deref(), shutdown.clone())?;
+        tasks.spawn(async move {
+            if let Some(carrier) = carrier {
+                carrier.await
+            }
+        });
+        let worker = parts.work(&config, &traces, &shutdown, &mut tasks).await?;
         tasks.spawn(keeping::keep(
             parts.queue.clone(),
             parts.store.clone(),
@@ -81,19 +92,31 @@ impl Server {
             queue: parts.queue,
             store: parts.store,
             worker,
+            callers: Arc::default(),
+            provider,
             shutdown: shutdown.clone(),
             metrics: telemetry::recorder(),
+            traces,
             address,
         };
         let db = state.queue.db().clone();
-        tasks.spawn(http::listen(listener, http::router(state), shutdown.clone()));
-        std::fs::write(config.data_dir.join("listen"), format!("http://{address}\n"))?;
-        Ok(Self { address, first_key, shutdown, tasks, db, _lock: lock })
+        if let Some(identity) = &identity {
+            tasks.spawn(Arc::clone(identity).follow(shutdown.clone()));
+        }
+        let scheme = if identity.is_some() { "https" } else { "http" };
+        tasks.spawn(http::listen(listener, identity, http::router(state), shutdown.clone()));
+        std::fs::write(config.data_dir.join("listen"), format!("{scheme}://{address}\n"))?;
+        Ok(Self { address, scheme, first_key, shutdown, tasks, db, _lock: lock })
     }
 
     /// The address really listened on.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// `https` with a certificate, else `http`.
+    pub fn scheme(&self) -> &'static str {
+        self.scheme
     }
 
     /// The admin key that this start made; shown once and stored nowhere.
@@ -130,6 +153,7 @@ impl Parts {
     async fn work(
         &self,
         config: &Arc<Config>,
+        traces: &Traces,
         shutdown: &CancellationToken,
         tasks: &mut JoinSet<()>,
     ) -> anyhow::Result<Option<Arc<Worker>>> {
@@ -150,6 +174,8 @@ impl Parts {
             heartbeat: Heartbeat::start(&self.queue, Arc::clone(&owner))?,
             owner,
             memory: Memory::new(config.memory_mb, config.workers),
+            isolation: Isolation::default(),
+            traces: traces.clone(),
             shutdown: shutdown.clone(),
         });
         tasks.spawn(Arc::clone(&worker).roll());
@@ -177,17 +203,18 @@ fn lock(data_dir: &Path) -> anyhow::Result<File> {
     }
 }
 
-/// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` on stdout, and at the
+/// Serves API, portal and workers until SIGINT or SIGTERM. Prints `listening on http://...` (or `https://...`) on stdout, and at the
 /// first start the admin key with a portal link that carries it.
 ///
 /// # Errors
 /// See [`Server::start`].
 pub async fn serve(config: Config) -> anyhow::Result<()> {
     let server = Server::start(config).await?;
-    say(&format!("listening on http://{}", server.address()))?;
+    let scheme = server.scheme();
+    say(&format!("listening on {scheme}://{}", server.address()))?;
     if let Some(key) = server.first_key() {
         say(&format!("admin key (shown once): {key}"))?;
-        say(&format!("portal: http://{}/#key={key}", server.address()))?;
+        say(&format!("portal: {scheme}://{}/#key={key}", server.address()))?;
     }
     stop_signal().await?;
     tracing::info!("stopping");
@@ -209,7 +236,13 @@ pub async fn work(config: Config) -> anyhow::Result<()> {
     let parts = Parts::open(&config).await?;
     let shutdown = CancellationToken::new();
     let mut tasks = JoinSet::new();
-    let worker = parts.work(&config, &shutdown, &mut tasks).await?;
+    let (traces, carrier) = Traces::new(config.otlp_endpoint.as_deref(), shutdown.clone())?;
+    tasks.spawn(async move {
+        if let Some(carrier) = carrier {
+            carrier.await
+        }
+    });
+    let worker = parts.work(&config, &traces, &shutdown, &mut tasks).await?;
     tasks.spawn(parts.queue.clone().carry_hints(shutdown.clone()));
     say(&format!("working on {} jobs at a time", config.workers))?;
     stop_signal().await?;

@@ -1,12 +1,13 @@
 //! What every request handler shares.
 
 use crate::audit::{self, Entry};
-use crate::auth::Principal;
+use crate::auth::{Callers, Principal, Provider};
 use crate::config::Config;
 use crate::db::{Scope, args};
 use crate::error::Problem;
 use crate::queue::Queue;
 use crate::store::Store;
+use crate::traces::Traces;
 use crate::worker::Worker;
 use metrics_exporter_prometheus::PrometheusHandle;
 use std::net::SocketAddr;
@@ -28,12 +29,18 @@ pub struct State {
     pub store: Store,
     /// The workers of this process, if any.
     pub worker: Option<Arc<Worker>>,
+    /// Callers whose keys are looked up at the same time.
+    pub(crate) callers: Arc<Callers>,
+    /// Who checks bearer tokens that are no API keys.
+    pub provider: Option<Arc<Provider>>,
     /// Memory for uploads, in units of [`UPLOAD_UNIT`].
     pub uploads: Arc<Semaphore>,
     /// Ends streams and long polls.
     pub shutdown: CancellationToken,
     /// Renders /metrics.
     pub metrics: PrometheusHandle,
+    /// Where traces go.
+    pub traces: Traces,
     /// The address really listened on.
     pub address: SocketAddr,
 }

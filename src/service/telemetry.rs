@@ -2,7 +2,7 @@
 //! installs the subscriber.
 
 use crate::error::Problem;
-use crate::state::State;
+use crate::state::{State, UPLOAD_UNIT};
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 use std::sync::OnceLock;
 
@@ -16,6 +16,12 @@ const JOBS: &str = "vasculum_jobs";
 const OLDEST: &str = "vasculum_oldest_queued_seconds";
 /// Jobs held by this process.
 const HELD: &str = "vasculum_jobs_held";
+/// Workers that spoke within the last minute, on every machine.
+const WORKERS: &str = "vasculum_workers";
+/// Free space of the data folder's disk, bytes.
+const DISK: &str = "vasculum_disk_free_bytes";
+/// Memory left for uploads, bytes.
+const UPLOADS: &str = "vasculum_upload_memory_free_bytes";
 /// From 1 ms to a minute.
 const BUCKETS: &[f64] = &[0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 60.0];
 
@@ -38,6 +44,9 @@ pub fn recorder() -> PrometheusHandle {
             metrics::describe_histogram!(DURATION, "HTTP request duration in seconds");
             metrics::describe_gauge!(JOBS, "Jobs by state");
             metrics::describe_gauge!(OLDEST, "Age of the oldest queued job in seconds");
+            metrics::describe_gauge!(WORKERS, "Workers that spoke within the last minute, on every machine");
+            metrics::describe_gauge!(DISK, "Free space of the data folder's disk in bytes");
+            metrics::describe_gauge!(UPLOADS, "Memory left for uploads in bytes");
             metrics::describe_gauge!(HELD, "Jobs held by the workers of this process");
             handle
         })
@@ -63,11 +72,17 @@ pub async fn scrape(state: &State) -> Result<String, Problem> {
     metrics::gauge!(OLDEST).set(as_f64(counts.oldest_queued_ms) / 1000.0);
     let held = state.worker.as_ref().map_or(0, |w| w.heartbeat.held());
     metrics::gauge!(HELD).set(as_f64(i64::try_from(held).unwrap_or(i64::MAX)));
+    let workers = state.queue.workers().await?.len();
+    metrics::gauge!(WORKERS).set(as_f64(i64::try_from(workers).unwrap_or(i64::MAX)));
+    let disk = crate::http::disk_free(state);
+    metrics::gauge!(DISK).set(as_f64(i64::try_from(disk).unwrap_or(i64::MAX)));
+    let uploads = state.uploads.available_permits() as u64 * UPLOAD_UNIT;
+    metrics::gauge!(UPLOADS).set(as_f64(i64::try_from(uploads).unwrap_or(i64::MAX)));
     state.metrics.run_upkeep();
     Ok(state.metrics.render())
 }
 
-/// Counts below 2^53 are exact in f64.
+/// Counts and bytes below 2^53 are exact in f64.
 #[allow(clippy::cast_precision_loss)]
 fn as_f64(count: i64) -> f64 {
     count as f64

@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use uuid::Uuid;
 
-/// Most plain bytes of a frame.
-pub(crate) const FRAME: usize = 256 << 10;
+/// Most plain bytes of a frame. At 256 KiB 50 uploads took 63 MiB together (the bar is 64).
+pub(crate) const FRAME: usize = 64 << 10;
 /// Uploads that a tenant may have open at the same time.
 pub(crate) const MOST: i64 = 64;
 /// How long an upload may take, and an unused one stays, ms.

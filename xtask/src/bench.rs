@@ -15,6 +15,8 @@ pub(crate) enum What {
     Thinning,
     /// The remeshing of the benchmark anastomosis beside other programs on the same surface.
     Surface,
+    /// GET of a job by wrk, and the memory of 50 uploads of 120 MB at the same time.
+    Service,
     /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued.
     Queue,
 }
@@ -29,6 +31,15 @@ pub(crate) fn thinning(repeat: usize) -> Result<()> {
     let mut bench = shell::command(tools::thinning_peers()?);
     bench.arg(shell::root()?.join("tests/bench/thinning.py"));
     bench.arg(tools::target()?.join("release/examples/thinning")).arg(&work).arg(repeat.to_string());
+    shell::run(bench)
+}
+
+/// Rates and memory of the service, by wrk and by uploads at the same time.
+pub(crate) fn service(binary: &Path) -> Result<()> {
+    tools::wrk()?;
+    let mut bench = shell::command(tools::python()?);
+    bench.arg(shell::root()?.join("tests/bench/service.py")).args(["10", "120"]);
+    bench.env("VASCULUM_ROOT", shell::root()?).env("VASCULUM_BIN", binary);
     shell::run(bench)
 }
 

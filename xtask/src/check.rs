@@ -18,6 +18,7 @@ pub(crate) fn all() -> Result<()> {
     lint()?;
     let mut test = shell::command("cargo");
     tools::postgres()?;
+    tools::openssl()?;
     // Its lack is then a failure of the queue's tests, not a reason to skip them.
     test.args(["test", "--workspace", "--quiet"])
         .env("VASCULUM_POSTGRES", "required")
@@ -68,6 +69,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     shell::run(survey)?;
     let python = tools::python()?;
     tools::deploy()?;
+    tools::pacs()?;
+    tools::strace()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge
@@ -76,7 +79,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
             .env("VASCULUM_BIN", binary)
             .env("VASCULUM_OUT", &out)
             .env("VASCULUM_SCAN", &scan)
-            .env("SURFACES", &surfaces);
+            .env("SURFACES", &surfaces)
+            .env("VASCULUM_S3S", tools::s3()?);
         shell::run(judge)?;
     }
     let node = tools::node_packages()?;

@@ -97,6 +97,7 @@ fn run(command: Command) -> Result<()> {
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
         Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
+        Command::Bench { what: bench::What::Service, .. } => bench::service(&tools::release_binary()?),
         Command::Bench { what: bench::What::Queue, large, .. } => storm::bench(large),
         Command::Storm { kills, jobs, seed } => storm::run(kills, jobs, seed),
     }

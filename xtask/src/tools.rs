@@ -29,6 +29,8 @@ const PYTHON_PACKAGES: &[&str] = &[
     "schemathesis==4.32.5",
     "kubernetes-validate==1.37.0",
     "podman-compose==1.6.0",
+    "dicomweb-client==0.61.2",
+    "requests<3",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
@@ -91,12 +93,44 @@ pub(crate) fn postgres() -> Result<()> {
     apt("PostgreSQL (the queue is tested on it)", &["postgresql"])
 }
 
+/// Keys and certificates of the tests' own, and a client that trusts them.
+pub(crate) fn openssl() -> Result<()> {
+    if shell::has("openssl") && shell::has("curl") {
+        return Ok(());
+    }
+    apt("OpenSSL and curl (the tests make keys and certificates and ask by them)", &["openssl", "curl"])
+}
+
 /// Programs that read the files of deploy/.
 pub(crate) fn deploy() -> Result<()> {
     if shell::has("promtool") && PathBuf::from("/usr/sbin/nginx").exists() {
         return Ok(());
     }
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
+}
+
+/// What asks a service as often as it can.
+pub(crate) fn wrk() -> Result<()> {
+    if shell::has("wrk") {
+        return Ok(());
+    }
+    apt("wrk (it measures the rate of requests)", &["wrk"])
+}
+
+/// What writes down every write and sync of a process.
+pub(crate) fn strace() -> Result<()> {
+    if shell::has("strace") {
+        return Ok(());
+    }
+    apt("strace (the database's file is looked at after each of its syncs)", &["strace"])
+}
+
+/// A PACS that sends by DICOMweb, and what feeds it. The package's own service is of no use here.
+pub(crate) fn pacs() -> Result<()> {
+    if PathBuf::from("/usr/sbin/Orthanc").exists() && shell::has("storescu") {
+        return Ok(());
+    }
+    apt("Orthanc and dcmtk (they send a series by DICOMweb)", &["orthanc", "orthanc-dicomweb", "dcmtk"])
 }
 
 /// An S3 server that checks signatures and checksums, for the store's tests; its program.

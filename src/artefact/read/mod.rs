@@ -29,6 +29,7 @@ mod volume;
 
 pub use crate::NamedBytes;
 pub use collect::collect;
+pub use dicom::{InstanceNames, instance};
 pub use error::Error;
 pub use intake::intake;
 pub use limits::Limits;

@@ -2,14 +2,20 @@
 //!
 //! A key is `vsk_` and 256 random bits in hexadecimal; only its SHA-256 is stored (nothing of low entropy, so no slow
 //! hash). It comes as `Authorization: Bearer` or, for the portal's own page, as an HttpOnly SameSite=Strict cookie
-//! that `POST /v1/session` sets; a changing call by cookie must come from the same origin.
+//! that `POST /v1/session` sets; a changing call by cookie must come from the same origin. Whatever else comes as a bearer
+//! is a token of the configured identity provider ([`oidc`]), or nothing.
 
+mod jwks;
 pub mod keys;
 pub mod links;
+mod oidc;
 mod pace;
+pub mod tenants;
+
+pub use oidc::Provider;
 
 use crate::config::Auth;
-use crate::db::{Db, Scope, args};
+use crate::db::{Db, MOST, Scope, Together, Value, args};
 use crate::error::Problem;
 use crate::state::State;
 use crate::store::hex;
@@ -17,6 +23,7 @@ use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode, header};
 use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
 use uuid::Uuid;
 
 /// Begins every API key.
@@ -86,7 +93,7 @@ pub struct Principal {
     pub tenant: String,
     /// What may be done.
     pub role: Role,
-    /// Which key: its id, for the audit. `open` for a service without keys.
+    /// Which key: its id, for the audit. `oidc:` and the subject of a token; `open` for a service without keys.
     pub actor: String,
     /// Largest upload of this key, bytes.
     pub max_bytes: Option<u64>,
@@ -119,24 +126,65 @@ fn digest(key: &str) -> Vec<u8> {
     Sha256::digest(key.as_bytes()).to_vec()
 }
 
+/// A key's row.
+#[derive(Clone, Debug)]
+pub(crate) struct Found {
+    id: String,
+    tenant: String,
+    role: String,
+    max_bytes: Option<i64>,
+    requests_per_minute: Option<i64>,
+}
+
+/// Callers whose keys are looked up at the same time, by digest.
+pub(crate) type Callers = Together<Vec<u8>, Found>;
+
 /// The principal of a key, or a 401.
-///
-/// # Errors
-/// `auth.key` when the key is unknown or revoked; the database's.
-pub async fn principal(db: &Db, key: &str) -> Result<Principal, Problem> {
-    let sql =
-        "SELECT id, tenant, role, max_bytes, requests_per_minute FROM api_key WHERE digest = $1 AND revoked_at IS NULL";
-    let row = db.row(Scope::System, sql, args![digest(key)]).await?;
-    let Some(row) = row else {
+async fn principal(state: &State, key: &str) -> Result<Principal, Problem> {
+    let found = state.callers.row(digest(key), |_, _| true, |digests| found(state.queue.db(), digests)).await?;
+    let Some(found) = found else {
         return Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one."));
     };
-    let role = Role::of(row.get("role")?).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
-    let max_bytes = row.get::<Option<i64>>("max_bytes")?.and_then(|n| u64::try_from(n).ok());
-    let id: String = row.get("id")?;
-    if let Some(most) = row.get::<Option<i64>>("requests_per_minute")? {
-        pace::count(&id, most)?;
+    let role = Role::of(&found.role).ok_or_else(|| Problem::internal("a key with an unknown role"))?;
+    if let Some(most) = found.requests_per_minute {
+        pace::count(&found.id, most)?;
     }
-    Ok(Principal { tenant: row.get("tenant")?, role, actor: id, max_bytes })
+    let max_bytes = found.max_bytes.and_then(|n| u64::try_from(n).ok());
+    Ok(Principal { tenant: found.tenant, role, actor: found.id, max_bytes })
+}
+
+const KEYS: &str = "SELECT id, tenant, role, max_bytes, requests_per_minute, digest FROM api_key \
+    WHERE revoked_at IS NULL AND digest IN ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, \
+    $18, $19, $20, $21, $22, $23, $24, $25, $26, $27, $28, $29, $30, $31, $32)";
+
+/// Keys that count, by digest.
+async fn found(db: &Db, digests: Vec<Vec<u8>>) -> sqlx::Result<BTreeMap<Vec<u8>, Found>> {
+    let Some(last) = digests.last().cloned() else { return Ok(BTreeMap::new()) };
+    let mut values: Vec<Value> = digests.into_iter().map(Value::from).collect();
+    values.resize(MOST, Value::from(last));
+    let rows = db.rows(Scope::System, KEYS, values).await?;
+    let read = |row: &crate::db::Row| {
+        let found = Found {
+            id: row.get("id")?,
+            tenant: row.get("tenant")?,
+            role: row.get("role")?,
+            max_bytes: row.get("max_bytes")?,
+            requests_per_minute: row.get("requests_per_minute")?,
+        };
+        Ok((row.get("digest")?, found))
+    };
+    rows.iter().map(read).collect()
+}
+
+/// The caller of an API key or of a token.
+///
+/// # Errors
+/// `auth.key`, `auth.token` and what else the check says; the database's.
+pub async fn known(state: &State, secret: &str) -> Result<Principal, Problem> {
+    match &state.provider {
+        Some(provider) if !secret.starts_with(KEY_PREFIX) => provider.principal(state.queue.db(), secret).await,
+        _ => principal(state, secret).await,
+    }
 }
 
 fn unauthorized(code: &str, detail: &str) -> Problem {
@@ -191,7 +239,11 @@ impl Caller {
         if self.0.role.may(action) {
             Ok(self.0)
         } else {
-            Err(Problem::new(StatusCode::FORBIDDEN, "auth.role", "This API key may not do that. Ask the operator."))
+            Err(Problem::new(
+                StatusCode::FORBIDDEN,
+                "auth.role",
+                "This key or token may not do that. Ask the operator.",
+            ))
         }
     }
 }
@@ -222,7 +274,7 @@ impl FromRequestParts<State> for Caller {
             Some(Sent::Bearer(token)) if token.starts_with(links::LINK_PREFIX) => {
                 links::caller(state.queue.db(), token, parts.uri.path(), safe).await
             }
-            Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(principal(state.queue.db(), key).await?)),
+            Some(Sent::Bearer(key) | Sent::Cookie(key)) => Ok(Self(known(state, key).await?)),
         }
     }
 }

@@ -10,8 +10,10 @@
 
 mod postgres;
 mod sqlite;
+mod together;
 mod value;
 
+pub(crate) use together::{MOST, Together};
 pub(crate) use value::args;
 pub use value::{Row, Tx, Value};
 

@@ -27,8 +27,9 @@ const WORKERS: usize = 2;
 const CALLERS: usize = 6;
 /// Times that PostgreSQL is stopped at once.
 const CRASHES: usize = 20;
-/// How long everything may take to settle after the last kill.
-const SETTLE: Duration = Duration::from_secs(300);
+/// After the last kill, how long no job may end while some are open: a backlog may take its time, a job that stands may not
+/// (on a busy machine 20,000 jobs on PostgreSQL were still draining after 300 s).
+const SETTLE: Duration = Duration::from_secs(60);
 
 fn main() -> Result<()> {
     let words: Vec<String> = std::env::args().skip(1).collect();
@@ -283,15 +284,20 @@ impl Caller {
 async fn settle(place: &Place, processes: &mut [Child], accepted: &BTreeMap<String, u8>) -> Result<()> {
     let client = reqwest::Client::new();
     let begun = Instant::now();
+    let (mut fewest, mut since) = (i64::MAX, Instant::now());
     loop {
         revive(place, processes)?;
-        if let Ok(stats) = json(&client, &format!("{}/v1/stats", place.base())).await
-            && stats["jobs"]["queued"] == 0
-            && stats["jobs"]["running"] == 0
-        {
-            break;
+        if let Ok(stats) = json(&client, &format!("{}/v1/stats", place.base())).await {
+            let count = |state: &str| stats["jobs"][state].as_i64().unwrap_or(i64::MAX / 2);
+            let open = count("queued") + count("running");
+            if open == 0 {
+                break;
+            }
+            if open < fewest {
+                (fewest, since) = (open, Instant::now());
+            }
         }
-        ensure!(begun.elapsed() < SETTLE, "jobs are still open {SETTLE:?} after the last kill");
+        ensure!(since.elapsed() < SETTLE, "{fewest} jobs are open and none has ended for {SETTLE:?}");
         tokio::time::sleep(Duration::from_millis(300)).await;
     }
     println!("everything ended {:.1} s after the last kill", begun.elapsed().as_secs_f64());

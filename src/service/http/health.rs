@@ -81,7 +81,7 @@ fn ok() -> String {
 }
 
 /// Free space of the data folder's disk, bytes; 0 when it cannot be told.
-pub(super) fn disk_free(state: &State) -> u64 {
+pub(crate) fn disk_free(state: &State) -> u64 {
     rustix::fs::statvfs(&state.config.data_dir).map_or(0, |fs| fs.f_bavail.saturating_mul(fs.f_frsize))
 }
 

@@ -4,6 +4,7 @@ mod admin;
 mod artefacts;
 mod describe;
 mod events;
+mod examples;
 mod guard;
 mod health;
 mod jobs;
@@ -17,11 +18,13 @@ mod range;
 mod session;
 mod shapes;
 mod stats;
+mod stow;
 mod taking;
 mod uploads;
 mod webhooks;
 mod workers;
 
+pub(crate) use health::disk_free;
 pub(crate) use listen::listen;
 
 use crate::state::State;
@@ -49,6 +52,7 @@ const SMALL_BODY: usize = 64 << 10;
     modifiers(&Keys),
     tags(
         (name = "jobs", description = "Send a scan, follow it, end it"),
+        (name = "dicomweb", description = "Send a series from a PACS or a viewer (STOW-RS)"),
         (name = "results", description = "What a job made"),
         (name = "webhooks", description = "Be told when a job ends"),
         (name = "monitoring", description = "Is it well, and how busy is it"),
@@ -63,7 +67,10 @@ struct Keys;
 impl utoipa::Modify for Keys {
     fn modify(&self, api: &mut utoipa::openapi::OpenApi) {
         use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
-        let bearer = HttpBuilder::new().scheme(HttpAuthScheme::Bearer).bearer_format("vsk_ API key").build();
+        let bearer = HttpBuilder::new()
+            .scheme(HttpAuthScheme::Bearer)
+            .bearer_format("vsk_ API key, or a token (JWT) of the configured identity provider")
+            .build();
         let components = api.components.get_or_insert_with(Default::default);
         components.add_security_scheme("key", SecurityScheme::Http(bearer));
     }
@@ -75,6 +82,7 @@ fn documented() -> OpenApiRouter<State> {
         .merge(order::router())
         .merge(links::router())
         .merge(uploads::router())
+        .merge(stow::router())
         .merge(events::router())
         .merge(artefacts::router())
         .merge(stats::router())
@@ -89,6 +97,7 @@ fn documented() -> OpenApiRouter<State> {
 pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
     let mut document = documented().into_openapi();
     describe::complete(&mut document);
+    examples::illustrate(&mut document);
     document
 }
 
@@ -96,6 +105,7 @@ pub(crate) fn openapi() -> utoipa::openapi::OpenApi {
 pub(crate) fn router(state: State) -> Router {
     let (api, mut document) = documented().split_for_parts();
     describe::complete(&mut document);
+    examples::illustrate(&mut document);
     let document = Arc::new(document);
     let page = portal::router(&state.config.frame_ancestors).layer(CompressionLayer::new());
     let described = Router::new()
@@ -112,7 +122,7 @@ pub(crate) fn router(state: State) -> Router {
         .layer(from_fn(listen::paced))
         .layer(from_fn(guard::plain))
         .layer(from_fn_with_state(state.clone(), guard::host))
-        .layer(from_fn(guard::headers))
-        .layer(from_fn(problems::layer))
+        .layer(from_fn_with_state(state.clone(), guard::headers))
+        .layer(from_fn_with_state(state.clone(), problems::layer))
         .with_state(state)
 }

@@ -1,14 +1,15 @@
 //! The outermost layer: trace id, span, metrics, and every error as a problem with `instance` and `trace_id`.
 
 use crate::error::Problem;
-use crate::store::hex;
+use crate::state::State;
 use crate::telemetry;
+use crate::traces::{Parent, random};
 use axum::body::{Body, to_bytes};
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{MatchedPath, Request, State as Shared};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 use tracing::Instrument as _;
 
 /// The answer's header with the trace id.
@@ -20,22 +21,29 @@ const LONGEST_TEXT: usize = 4096;
 #[derive(Clone, Debug)]
 pub(crate) struct TraceId(pub String);
 
+/// Marks an answer of an error's status whose body is what its standard says, and no problem.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Whole;
+
 /// The layer.
-pub(crate) async fn layer(mut request: Request, next: Next) -> Response {
-    let begun = Instant::now();
-    let trace = trace_of(request.headers());
+pub(crate) async fn layer(Shared(state): Shared<State>, mut request: Request, next: Next) -> Response {
+    let (begun, at) = (Instant::now(), SystemTime::now());
+    let parent = trace_of(request.headers());
+    let trace = parent.trace.clone();
     let path = request.uri().path().to_owned();
     let method = request.method().clone();
     let route = request.extensions().get::<MatchedPath>().map_or("other", |m| m.as_str()).to_owned();
     request.extensions_mut().insert(TraceId(trace.clone()));
     let span = tracing::info_span!("request", %method, route = %route, trace_id = %trace);
     let mut response = next.run(request).instrument(span).await;
-    if response.status().is_client_error() || response.status().is_server_error() {
+    let failed = response.status().is_client_error() || response.status().is_server_error();
+    if failed && response.extensions_mut().remove::<Whole>().is_none() {
         response = told(response, &path, &trace).await;
     }
     if let Ok(value) = HeaderValue::from_str(&trace) {
         response.headers_mut().insert(TRACE_HEADER, value);
     }
+    state.traces.request(&parent, at, method.as_str(), &route, response.status().as_u16());
     let status = response.status().as_u16().to_string();
     metrics::counter!(telemetry::REQUESTS, "method" => method.to_string(), "route" => route.clone(), "status" => status)
         .increment(1);
@@ -43,20 +51,11 @@ pub(crate) async fn layer(mut request: Request, next: Next) -> Response {
     response
 }
 
-/// The trace id of a W3C `traceparent`, or a random one.
-fn trace_of(headers: &HeaderMap) -> String {
-    let sent = headers.get("traceparent").and_then(|v| v.to_str().ok()).and_then(|v| v.split('-').nth(1));
-    match sent {
-        Some(id) if id.len() == 32 && id.bytes().all(|b| b.is_ascii_hexdigit()) && id.bytes().any(|b| b != b'0') => {
-            id.to_ascii_lowercase()
-        }
-        _ => {
-            let mut bytes = [0_u8; 16];
-            // Without random bytes the trace is all zeros: a request is not refused for that.
-            let _ = getrandom::fill(&mut bytes);
-            hex(&bytes)
-        }
-    }
+/// The trace of a W3C `traceparent`, or one of its own.
+fn trace_of(headers: &HeaderMap) -> Parent {
+    let sent = headers.get("traceparent").and_then(|v| v.to_str().ok()).and_then(Parent::of);
+    // Without random bytes the trace is all zeros: a request is not refused for that.
+    sent.unwrap_or_else(|| Parent { trace: random::<16>(), span: String::new(), sampled: true })
 }
 
 /// The response as a problem, its own headers kept.
@@ -104,8 +103,8 @@ mod tests {
         let mut headers = HeaderMap::new();
         let id = "4bf92f3577b34da6a3ce929d0e0e4736";
         headers.insert("traceparent", format!("00-{id}-00f067aa0ba902b7-01").parse().unwrap());
-        assert_eq!(trace_of(&headers), id);
+        assert_eq!(trace_of(&headers).trace, id);
         headers.insert("traceparent", "00-<script>-x-01".parse().unwrap());
-        assert_eq!(trace_of(&headers).len(), 32);
+        assert_eq!(trace_of(&headers).trace.len(), 32);
     }
 }

@@ -1,6 +1,6 @@
 //! The portal's session: its key as a cookie that scripts cannot read, so that downloads by a link work.
 
-use crate::auth::{COOKIE, principal};
+use crate::auth::{COOKIE, known};
 use crate::config::Auth;
 use crate::error::Problem;
 use crate::state::State;
@@ -32,9 +32,11 @@ struct Session {
 ))]
 async fn begin(Shared(state): Shared<State>, Json(session): Json<Session>) -> Result<Response, Problem> {
     if state.config.auth == Auth::Required {
-        principal(state.queue.db(), &session.key).await?;
+        known(&state, &session.key).await?;
     }
-    Ok(cookie(&format!("{COOKIE}={}; Path=/; HttpOnly; SameSite=Strict", session.key)))
+    // Behind our own TLS the cookie never goes over a plain line.
+    let secure = if state.config.tls.is_some() { "; Secure" } else { "" };
+    Ok(cookie(&format!("{COOKIE}={}; Path=/; HttpOnly; SameSite=Strict{secure}", session.key)))
 }
 
 /// Who calls.

@@ -31,6 +31,8 @@ struct WorkerShape {
     busy: i64,
     /// Memory that its jobs may take together, MiB.
     memory_mb: i64,
+    /// What stands between its jobs and the network: `namespace, filter`, one of them, or `none`; null before its first job.
+    isolation: Option<String>,
     /// RFC 3339, UTC.
     started_at: Option<String>,
     /// RFC 3339, UTC: its last word, at most 10 s ago when it is well.
@@ -61,6 +63,7 @@ async fn workers(Shared(state): Shared<State>, _who: Principal) -> Result<Json<W
         slots: row.slots,
         busy: row.busy,
         memory_mb: row.memory_mb,
+        isolation: row.isolation,
     };
     Ok(Json(WorkerList { items: rows.into_iter().map(shape).collect(), next: None }))
 }

@@ -22,6 +22,8 @@ pub struct WorkerRow {
     pub busy: i64,
     /// Memory that it may give to jobs, MiB.
     pub memory_mb: i64,
+    /// What stands between its jobs and the network; unknown before the first job.
+    pub isolation: Option<String>,
     /// Start, ms since 1970.
     pub started_at: i64,
     /// Last word, ms since 1970.
@@ -37,6 +39,7 @@ impl WorkerRow {
             slots: row.get("slots")?,
             busy: row.get("busy")?,
             memory_mb: row.get("memory_mb")?,
+            isolation: row.get("isolation")?,
             started_at: row.get("started_at")?,
             seen_at: row.get("seen_at")?,
         })
@@ -55,18 +58,6 @@ impl Queue {
         rows.iter().map(|row| Ok((row.get("tenant")?, parsed(row.get("id")?)?))).collect()
     }
 
-    /// Sets what a tenant may do: jobs running at the same time, and how long ended jobs are kept, ms. `None` lifts
-    /// the bound. Makes the tenant if it is new.
-    ///
-    /// # Errors
-    /// The database's.
-    pub async fn set_tenant(&self, tenant: &str, max_running: Option<i64>, keep_ms: Option<i64>) -> sqlx::Result<()> {
-        let sql = "INSERT INTO tenant (id, name, max_running, retention_ms, created_at) VALUES ($1, $1, $2, $3, now_ms()) \
-                   ON CONFLICT (id) DO UPDATE SET max_running = excluded.max_running, retention_ms = excluded.retention_ms";
-        self.db().run(Scope::System, sql, args![tenant, max_running, keep_ms]).await?;
-        Ok(())
-    }
-
     /// Writes a worker into the roll, or renews its line; forgets those that went without a word.
     ///
     /// # Errors
@@ -76,10 +67,12 @@ impl Queue {
         self.db()
             .write(Scope::System, move |tx| {
                 Box::pin(async move {
-                    let line = "INSERT INTO worker (id, host, version, slots, busy, memory_mb, started_at, seen_at) \
-                        VALUES ($1, $2, $3, $4, $5, $6, now_ms(), now_ms()) ON CONFLICT (id) \
-                        DO UPDATE SET busy = excluded.busy, memory_mb = excluded.memory_mb, seen_at = now_ms()";
-                    let values = args![&row.id, &row.host, &row.version, row.slots, row.busy, row.memory_mb];
+                    let line = "INSERT INTO worker (id, host, version, slots, busy, memory_mb, isolation, started_at, seen_at) \
+                        VALUES ($1, $2, $3, $4, $5, $6, $7, now_ms(), now_ms()) ON CONFLICT (id) DO UPDATE SET \
+                        busy = excluded.busy, memory_mb = excluded.memory_mb, isolation = excluded.isolation, \
+                        seen_at = now_ms()";
+                    let values =
+                        args![&row.id, &row.host, &row.version, row.slots, row.busy, row.memory_mb, &row.isolation];
                     tx.run(line, values).await?;
                     tx.run("DELETE FROM worker WHERE seen_at < now_ms() - $1", args![FORGOTTEN_MS]).await?;
                     Ok(())

@@ -6,10 +6,11 @@
 //! seen event N has seen everything before it. Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
-//! `submit` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
+//! `submit`, `gather` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
 
 mod claim;
 mod finish;
+mod gather;
 mod keep;
 mod read;
 pub(crate) mod submit;
@@ -17,12 +18,14 @@ mod types;
 
 pub use claim::{Beat, Claim, Room, Verdict};
 pub use finish::{Closing, Published};
+pub use gather::Grown;
 pub use keep::WorkerRow;
 pub use read::{Counts, Page};
 pub use submit::{NewJob, Submitted};
 pub use types::{ArtefactRow, EventRow, JobRow, JobState};
 
-use crate::db::Db;
+use crate::db::{Db, Together};
+use std::sync::Arc;
 use tokio::sync::{broadcast, mpsc};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
@@ -44,18 +47,21 @@ pub struct Queue {
     db: Db,
     hints: broadcast::Sender<Uuid>,
     told: broadcast::Sender<Uuid>,
+    /// Callers that ask for single jobs at the same time, by tenant and id.
+    asked: Arc<Together<(String, String), JobRow>>,
 }
 
 impl Queue {
     /// A queue over an open database.
     pub fn new(db: Db) -> Self {
-        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS) }
+        let asked = Arc::default();
+        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS), asked }
     }
 
     /// The same table and hints through another connection (the heartbeat thread has its own).
     #[must_use]
     pub fn with_db(&self, db: Db) -> Self {
-        Self { db, hints: self.hints.clone(), told: self.told.clone() }
+        Self { db, hints: self.hints.clone(), told: self.told.clone(), asked: Arc::default() }
     }
 
     /// The database under it.

@@ -1,8 +1,13 @@
 //! Reading: one job, pages of jobs, events, artefacts, counts. Every read of a request names the tenant.
 
 use super::{ArtefactRow, EventRow, JobRow, JobState, Queue};
-use crate::db::{Scope, args};
+use crate::db::{MOST, Scope, Value, args};
+use std::collections::BTreeMap;
 use uuid::Uuid;
+
+const ONE: &str = "SELECT * FROM job WHERE tenant = $1 AND id = $2";
+const SOME: &str = "SELECT * FROM job WHERE tenant = $1 AND id IN ($2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, \
+    $14, $15, $16, $17, $18, $19, $20, $21, $22, $23, $24, $25, $26, $27, $28, $29, $30, $31, $32, $33)";
 
 /// Which jobs to list, newest first.
 #[derive(Clone, Debug, Default)]
@@ -38,11 +43,21 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn job(&self, tenant: &str, id: Uuid) -> sqlx::Result<Option<JobRow>> {
-        let row = self
-            .db()
-            .row(Scope::Tenant(tenant), "SELECT * FROM job WHERE id = $1 AND tenant = $2", args![id, tenant])
-            .await?;
-        row.as_ref().map(JobRow::of).transpose()
+        let same_tenant = |a: &(String, String), b: &(String, String)| a.0 == b.0;
+        self.asked.row((tenant.to_owned(), id.to_string()), same_tenant, |keys| self.named(keys)).await
+    }
+
+    /// Jobs of one tenant by tenant and id.
+    async fn named(&self, keys: Vec<(String, String)>) -> sqlx::Result<BTreeMap<(String, String), JobRow>> {
+        let (Some((tenant, last)), many) = (keys.last(), keys.len() > 1) else { return Ok(BTreeMap::new()) };
+        let mut values = args![tenant];
+        values.extend(keys.iter().map(|(_, id)| Value::from(id)));
+        if many {
+            // The statement has always the same number of arguments, so that it is prepared once.
+            values.resize(1 + MOST, Value::from(last));
+        }
+        let rows = self.db().rows(Scope::Tenant(tenant), if many { SOME } else { ONE }, values).await?;
+        rows.iter().map(|row| JobRow::of(row).map(|job| ((job.tenant.clone(), job.id.clone()), job))).collect()
     }
 
     /// A page of jobs, newest first, by key and never by offset.

@@ -201,7 +201,7 @@ impl Queue {
     }
 }
 
-async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Submitted> {
+pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Submitted> {
     if let Some(key) = &job.idempotency_key {
         let earlier = "SELECT * FROM job WHERE tenant = $1 AND idempotency_key = $2";
         if let Some(row) = tx.row(earlier, args![&job.tenant, key]).await? {

@@ -1,6 +1,7 @@
 //! The artefact store: object keys and bytes, on a local folder with fsync or in any S3.
 //!
-//! Keys: `jobs/<id>/input/NNNNNN` with a manifest beside them, and `jobs/<id>/artefacts/<fence>/<name>`. The fence in
+//! Keys: `jobs/<id>/input/<digest>` with a manifest beside them, named by its own digest too, so that an input that
+//! grows (DICOMweb) never overwrites what the job table names, and `jobs/<id>/artefacts/<fence>/<name>`. The fence in
 //! the key keeps a worker that lost its lease from overwriting the files of the one that holds it. An object exists
 //! for readers only once the job table names it; whatever else lies here is an orphan and is swept at start.
 
@@ -74,6 +75,18 @@ pub struct Input {
     pub files: Vec<InputFile>,
 }
 
+impl Input {
+    /// The input of these files.
+    pub fn of(files: Vec<InputFile>) -> Self {
+        Self { digest: digest(&manifest_bytes(&files)), files }
+    }
+
+    /// Size of all files together.
+    pub fn bytes(&self) -> u64 {
+        self.files.iter().map(|file| file.bytes).sum()
+    }
+}
+
 /// The store. Cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Store {
@@ -102,8 +115,17 @@ fn job_prefix(job: Uuid) -> Key {
     Key::from_iter(["jobs", &job.to_string()])
 }
 
-fn input_key(job: Uuid, name: &str) -> Key {
-    Key::from_iter(["jobs", &job.to_string(), "input", name])
+/// The key of a file of an input, by its digest.
+fn input_key(job: Uuid, digest: &str) -> Key {
+    Key::from_iter(["jobs", &job.to_string(), "input", hex_of(digest)])
+}
+
+fn manifest_key(job: Uuid, digest: &str) -> Key {
+    Key::from_iter(["jobs", &job.to_string(), "input", &format!("manifest-{}.json", hex_of(digest))])
+}
+
+fn hex_of(digest: &str) -> &str {
+    digest.strip_prefix("sha256:").unwrap_or(digest)
 }
 
 impl Store {
@@ -155,23 +177,33 @@ impl Store {
 
     /// Digests of an input's files and of its manifest, without storing anything.
     pub fn describe(files: &[(String, Vec<u8>)]) -> Input {
-        let files: Vec<InputFile> = files
+        let files = files
             .iter()
             .map(|(name, bytes)| InputFile { name: name.clone(), bytes: bytes.len() as u64, digest: digest(bytes) })
             .collect();
-        Input { digest: digest(&manifest_bytes(&files)), files }
+        Input::of(files)
     }
 
-    /// Stores an input; the manifest comes last, so that a manifest means a whole input.
+    /// Stores the files of an input, or those that are new in it, and then its manifest, so that a manifest means a whole
+    /// input.
     ///
     /// # Errors
     /// The store's.
     pub async fn put_input(&self, job: Uuid, input: &Input, files: Vec<(String, Vec<u8>)>) -> Result<(), Error> {
-        for (i, (_, bytes)) in files.into_iter().enumerate() {
-            self.objects.put(&input_key(job, &format!("{i:06}")), bytes.into()).await?;
+        for (_, bytes) in files {
+            self.objects.put(&input_key(job, &digest(&bytes)), bytes.into()).await?;
         }
-        self.objects.put(&input_key(job, "manifest.json"), manifest_bytes(&input.files).into()).await?;
+        self.objects.put(&manifest_key(job, &input.digest), manifest_bytes(&input.files).into()).await?;
         Ok(())
+    }
+
+    /// The files of a stored input.
+    ///
+    /// # Errors
+    /// The store's; a digest that does not match.
+    pub async fn manifest(&self, job: Uuid, wanted: &str) -> Result<Vec<InputFile>, Error> {
+        let manifest = self.verified(&manifest_key(job, wanted), wanted).await?;
+        serde_json::from_slice(&manifest).map_err(|source| Error::Manifest { job, source })
     }
 
     /// Writes a stored input into a folder of this machine, each file under its harmless name, digests checked.
@@ -179,11 +211,8 @@ impl Store {
     /// # Errors
     /// The store's; a digest that does not match.
     pub async fn fetch_input(&self, job: Uuid, wanted: &str, folder: &Path) -> Result<(), Error> {
-        let manifest = self.verified(&input_key(job, "manifest.json"), wanted).await?;
-        let files: Vec<InputFile> =
-            serde_json::from_slice(&manifest).map_err(|source| Error::Manifest { job, source })?;
-        for (i, file) in files.iter().enumerate() {
-            let bytes = self.verified(&input_key(job, &format!("{i:06}")), &file.digest).await?;
+        for file in self.manifest(job, wanted).await? {
+            let bytes = self.verified(&input_key(job, &file.digest), &file.digest).await?;
             tokio::fs::write(folder.join(&file.name), &bytes).await?;
         }
         Ok(())

@@ -7,6 +7,8 @@ mod support;
 use reqwest::{Method, StatusCode};
 use serde_json::json;
 use service::{Auth, Server};
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use support::{Service, problem};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -149,4 +151,24 @@ fn the_committed_document_is_the_generated_one() {
     let ids: Vec<_> = committed.lines().filter_map(|line| line.trim().strip_prefix("operationId: ")).collect();
     let once: std::collections::BTreeSet<_> = ids.iter().collect();
     assert_eq!(once.len(), ids.len(), "an operationId is used twice: {ids:?}");
+}
+
+/// 8 MiB are more than the sockets hold: a client that sends all before it listens hears why it is refused, however early
+/// that was (with PostgreSQL stopped, Python's `requests` saw a broken connection in place of the 503).
+#[tokio::test(flavor = "multi_thread")]
+async fn a_refusal_is_heard_by_who_is_still_sending() {
+    let service = Service::with(|config| config.auth = Auth::Required).await;
+    let address = service.server.as_ref().unwrap().address();
+    let heard = tokio::task::spawn_blocking(move || {
+        let mut line = TcpStream::connect(address).unwrap();
+        let body = vec![b'x'; 8 << 20];
+        let head = format!("POST /v1/jobs HTTP/1.1\r\nhost: x\r\ncontent-length: {}\r\n\r\n", body.len());
+        line.write_all(head.as_bytes()).unwrap();
+        line.write_all(&body).expect("the connection breaks while the body is sent");
+        let mut answer = [0; 12];
+        line.read_exact(&mut answer).expect("the answer is lost");
+        answer
+    });
+    assert_eq!(&heard.await.unwrap(), b"HTTP/1.1 401");
+    service.stop().await;
 }

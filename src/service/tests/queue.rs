@@ -4,6 +4,7 @@
 
 mod support;
 
+use service::auth::tenants;
 use service::db::{Db, Scope};
 use service::queue::{
     ArtefactRow, Beat, Claim, Closing, JobState, NewJob, Page, Published, Queue, Room, Submitted, Verdict,
@@ -255,7 +256,9 @@ async fn priority_and_waiting_share_one_scale(b: Bench) {
 
 async fn a_tenant_stays_under_its_cap(b: Bench) {
     let q = &b.queue;
-    q.set_tenant("ward", Some(2), None).await.unwrap();
+    tenants::set(q.db(), "ward", Some(2), None).await.unwrap();
+    let ward = tenants::list(q.db()).await.unwrap().pop().unwrap();
+    assert_eq!((ward.id.as_str(), ward.max_running, ward.keep_ms), ("ward", Some(2), None));
     for _ in 0..6 {
         add(q, |j| {
             j.tenant = "ward".into();
@@ -316,7 +319,7 @@ async fn a_key_makes_one_job(b: Bench) {
     assert_eq!((fresh, ids.len()), (1, 1));
     let other = NewJob { id: Uuid::now_v7(), plan: "{\"a\":1}".into(), ..job.clone() };
     assert!(matches!(q.submit(&other).await.unwrap(), Submitted::Mismatch(_)));
-    q.set_tenant("ward", None, None).await.unwrap();
+    tenants::set(q.db(), "ward", None, None).await.unwrap();
     let elsewhere = NewJob { id: Uuid::now_v7(), tenant: "ward".into(), ..job };
     assert!(matches!(q.submit(&elsewhere).await.unwrap(), Submitted::New(_)), "a key belongs to its tenant");
 }
@@ -346,7 +349,7 @@ async fn cancel_by_filter(b: Bench) {
     for _ in 0..3 {
         queued.push(add(q, |_| {}).await);
     }
-    q.set_tenant("ward", None, None).await.unwrap();
+    tenants::set(q.db(), "ward", None, None).await.unwrap();
     let foreign = add(q, |j| j.tenant = "ward".into()).await;
     assert!(q.cancel_all("default", None, Some(0)).await.unwrap().is_empty(), "none is so old");
     assert_eq!(q.cancel_all("default", Some(JobState::Queued), None).await.unwrap(), queued);
@@ -373,7 +376,7 @@ async fn retry_and_hand_back(b: Bench) {
 
 async fn retention_ends(b: Bench) {
     let q = &b.queue;
-    q.set_tenant("default", None, Some(60_000)).await.unwrap();
+    tenants::set(q.db(), "default", None, Some(60_000)).await.unwrap();
     let id = add(q, |_| {}).await;
     let held = claim(q).await.unwrap();
     q.close(&held, &success()).await.unwrap();
@@ -399,7 +402,7 @@ async fn webhooks_get_a_message_in_the_same_commit(b: Bench) {
 
 async fn a_tenant_sees_its_own_only(b: Bench) {
     let q = &b.queue;
-    q.set_tenant("ward", None, None).await.unwrap();
+    tenants::set(q.db(), "ward", None, None).await.unwrap();
     let id = add(q, |_| {}).await;
     assert!(q.job("ward", id).await.unwrap().is_none());
     assert!(q.jobs("ward", &Page { limit: 9, ..Page::default() }).await.unwrap().is_empty());
@@ -445,14 +448,15 @@ async fn workers_are_on_the_roll(b: Bench) {
         slots: 2,
         busy: 0,
         memory_mb: 100,
+        isolation: None,
         started_at: 0,
         seen_at: 0,
     };
     q.enrol(&worker).await.unwrap();
-    worker.busy = 1;
+    (worker.busy, worker.isolation) = (1, Some("filter".into()));
     q.enrol(&worker).await.unwrap();
     let roll = q.workers().await.unwrap();
-    assert_eq!((roll.len(), roll[0].busy), (1, 1));
+    assert_eq!((roll.len(), roll[0].busy, roll[0].isolation.as_deref()), (1, 1, Some("filter")));
     assert!(roll[0].seen_at > 0);
     q.strike_off("w").await.unwrap();
     assert!(q.workers().await.unwrap().is_empty());
@@ -512,7 +516,7 @@ async fn the_order_of_claims_does_not_slow_with_the_backlog(b: Bench) {
     if b.config.database_url.is_some() {
         sql(q, "ANALYZE job").await;
     }
-    q.set_tenant("ward", Some(0), None).await.unwrap();
+    tenants::set(q.db(), "ward", Some(0), None).await.unwrap();
     let begun = Instant::now();
     for k in 1..=30 {
         assert_eq!(claim(q).await.unwrap().id, format!("x{k}"));

@@ -68,6 +68,8 @@ const RULES: &[(&str, &str, Rule)] = &[
     ("HEAD", "/v1/uploads/{id}", Rule::Read),
     ("PATCH", "/v1/uploads/{id}", Rule::Change),
     ("DELETE", "/v1/uploads/{id}", Rule::Change),
+    ("POST", "/dicomweb/studies", Rule::Change),
+    ("POST", "/dicomweb/studies/{study}", Rule::Change),
     ("GET", "/v1/webhooks", Rule::Read),
     ("POST", "/v1/webhooks", Rule::Change),
     ("DELETE", "/v1/webhooks/{id}", Rule::Change),
@@ -130,7 +132,7 @@ impl Ward {
             _ if template.starts_with("/v1/uploads/") => &self.upload,
             _ => &self.job,
         };
-        template.replace("{id}", id).replace("{name}", "result.json")
+        template.replace("{id}", id).replace("{name}", "result.json").replace("{study}", "1.2.3")
     }
 }
 

@@ -1,8 +1,9 @@
 //! The child process of one job and its protocol.
 //!
-//! `EXE exec-job --input DIR --plan FILE --out DIR --threads N`, trace id in `VASCULUM_TRACE_ID`. Its stdout carries
-//! one JSON object per line: `{"stage", "progress", "eta_s"}`, and `{"error": {...}}` last on failure; stderr is log
-//! text. Exit codes: 0 done, 2 input, 3 limit, 4 numeric, 130 cancelled, 1 our own fault. The child leads a process
+//! `EXE exec-job --input DIR --plan FILE --out DIR --threads N`, trace id in `VASCULUM_TRACE_ID`, beside `TMPDIR` the only
+//! variable: keys and passwords of the service are not its business. Its stdout carries one JSON object per line: first
+//! `{"isolation"}` with the barriers between it and the network, then `{"stage", "progress", "eta_s"}`, and
+//! `{"error": {...}}` last on failure; stderr is log text. Exit codes: 0 done, 2 input, 3 limit, 4 numeric, 130 cancelled, 1 our own fault. The child leads a process
 //! group of its own, which is killed as one. It ends by itself when its stdin closes: this process holds the pipe
 //! open, so that a `kill -9` of the service ends its children too.
 
@@ -39,6 +40,8 @@ pub struct Step {
     pub eta_s: Option<f64>,
     /// The job's problem.
     pub error: Option<Problem>,
+    /// What stands between the child and the network.
+    pub isolation: Option<String>,
 }
 
 /// How the child ended.
@@ -82,7 +85,8 @@ impl Child {
         command.args(&config.executable_args).arg("exec-job");
         command.arg("--input").arg(folder.input()).arg("--plan").arg(folder.plan());
         command.arg("--out").arg(folder.out()).arg("--threads").arg(config.threads.to_string());
-        command.current_dir(folder.path()).env("TMPDIR", folder.path()).env("VASCULUM_TRACE_ID", &claim.trace_id);
+        command.env_clear().env("TMPDIR", folder.path()).env("VASCULUM_TRACE_ID", &claim.trace_id);
+        command.current_dir(folder.path());
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.process_group(0).kill_on_drop(true);
         let mut process =

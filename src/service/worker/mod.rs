@@ -10,10 +10,12 @@
 mod child;
 mod folder;
 mod heartbeat;
+mod isolation;
 mod memory;
 mod owner;
 
 pub use heartbeat::Heartbeat;
+pub use isolation::Isolation;
 pub use memory::Memory;
 pub(crate) use memory::expected_mb;
 pub use owner::Owner;
@@ -23,7 +25,8 @@ use crate::error::Problem;
 use crate::media::media_type;
 use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict, WorkerRow};
 use crate::store::Store;
-use child::{Child, Ended};
+use crate::traces::{Course, Traces};
+use child::{Child, Ended, Step};
 use folder::Folder;
 use heartbeat::Held;
 use std::sync::Arc;
@@ -53,6 +56,10 @@ pub struct Worker {
     pub owner: Arc<Owner>,
     /// What jobs may take together.
     pub memory: Memory,
+    /// What the last job said to stand between it and the network.
+    pub isolation: Isolation,
+    /// Where traces go.
+    pub traces: Traces,
     /// Ends everything.
     pub shutdown: CancellationToken,
 }
@@ -85,19 +92,21 @@ impl Worker {
         let held = self.heartbeat.hold(claim.uuid(), claim.fence);
         let _share = self.memory.take(claim.memory_mb);
         tracing::info!(job = %claim.id, attempt = claim.attempt, trace_id = %claim.trace_id, "job starts");
-        let closing = match self.run(claim, &held).await {
+        let mut course = self.traces.job(claim);
+        let closing = match self.run(claim, &held, &mut course).await {
             Ok(closing) => closing,
             Err(error) => {
                 tracing::error!(job = %claim.id, cause = %error, "job could not be run");
                 Some(Closing::Crashed("the service could not run it".to_owned()))
             }
         };
-        self.end(claim, closing).await;
+        let state = self.end(claim, closing).await;
+        course.ends(state.map_or("lost", JobState::as_str));
         drop(held);
     }
 
     /// `None`: the lease was lost on the way.
-    async fn run(&self, claim: &Claim, held: &Held) -> anyhow::Result<Option<Closing>> {
+    async fn run(&self, claim: &Claim, held: &Held, course: &mut Course<'_>) -> anyhow::Result<Option<Closing>> {
         let folder = Folder::make(&self.owner, claim).await?;
         if let Err(error) = self.store.fetch_input(claim.uuid(), &claim.input_digest, &folder.input()).await {
             // Erased meanwhile, or cancelled: the lease says which.
@@ -109,7 +118,7 @@ impl Worker {
         }
         tokio::fs::write(folder.plan(), &claim.plan).await?;
         let mut child = Child::start(&self.config, &folder, claim, self.memory.each())?;
-        let ended = self.watch(&mut child, held, claim).await?;
+        let ended = self.watch(&mut child, held, claim, course).await?;
         let closing = match ended {
             Some(Ended::Done) => match held.verdict() {
                 Verdict::Lost => None,
@@ -127,7 +136,13 @@ impl Worker {
     }
 
     /// Waits for the child, passing its progress on, and kills it when the job is cancelled, lost or handed back.
-    async fn watch(&self, child: &mut Child, held: &Held, claim: &Claim) -> anyhow::Result<Option<Ended>> {
+    async fn watch(
+        &self,
+        child: &mut Child,
+        held: &Held,
+        claim: &Claim,
+        course: &mut Course<'_>,
+    ) -> anyhow::Result<Option<Ended>> {
         let mut changes = self.queue.changes();
         let mut verdict = held.subscribe();
         let longest = Duration::from_secs(self.config.job_seconds);
@@ -136,7 +151,11 @@ impl Worker {
         loop {
             tokio::select! {
                 line = child.next() => match line {
-                    Some(step) => held.step(step),
+                    Some(Step { isolation: Some(barriers), .. }) => self.isolation.told(barriers),
+                    Some(step) => {
+                        step.stage.iter().for_each(|stage| course.enters(stage));
+                        held.step(step);
+                    }
                     None => return Ok(Some(child.end(&claim.id).await?)),
                 },
                 change = changes.recv() => {
@@ -173,6 +192,7 @@ impl Worker {
                 slots: i64::try_from(self.config.workers).unwrap_or(i64::MAX),
                 busy: i64::try_from(self.heartbeat.held()).unwrap_or(i64::MAX),
                 memory_mb: self.memory.all(),
+                isolation: self.isolation.last(),
                 started_at: 0,
                 seen_at: 0,
             };
@@ -181,6 +201,7 @@ impl Worker {
             }
             tokio::select! {
                 () = self.shutdown.cancelled() => {}
+                () = self.isolation.changed() => {}
                 () = tokio::time::sleep(ROLL) => {}
             }
         }
@@ -214,8 +235,9 @@ impl Worker {
         Ok(Closing::Succeeded(Published { artefacts }))
     }
 
-    /// Writes the end, trying again while the database is away, and drops the files of an attempt that did not count.
-    async fn end(&self, claim: &Claim, closing: Option<Closing>) {
+    /// Writes the end, trying again while the database is away, and drops the files of an attempt that did not count; the state that was
+    /// reached.
+    async fn end(&self, claim: &Claim, closing: Option<Closing>) -> Option<JobState> {
         let mut reached = None;
         if let Some(closing) = closing {
             loop {
@@ -227,7 +249,7 @@ impl Worker {
                     // At shutdown the lease simply runs out and the next start takes the job back.
                     Err(error) if self.shutdown.is_cancelled() => {
                         tracing::warn!(job = %claim.id, %error, "end not written, the job will be taken back");
-                        return;
+                        return None;
                     }
                     Err(error) => {
                         tracing::warn!(job = %claim.id, %error, "end not written, trying again");
@@ -238,7 +260,7 @@ impl Worker {
         }
         tracing::info!(job = %claim.id, state = reached.map_or("lost", JobState::as_str), "job ends");
         let erased = match reached {
-            Some(JobState::Succeeded) => return,
+            Some(JobState::Succeeded) => return reached,
             // A cancelled job forgets its scan: nothing of it stays on disk.
             Some(JobState::Cancelled) => self.store.erase_job(claim.uuid()).await,
             _ => self.store.erase_attempt(claim.uuid(), claim.fence).await,
@@ -246,6 +268,7 @@ impl Worker {
         if let Err(error) = erased {
             tracing::warn!(job = %claim.id, %error, "files left behind; the sweep at the next start takes them");
         }
+        reached
     }
 }
 

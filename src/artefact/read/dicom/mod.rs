@@ -8,6 +8,7 @@
 
 mod anonymous;
 pub(crate) mod dataset;
+mod instance;
 mod jpegls;
 mod pixels;
 mod rle;
@@ -16,6 +17,7 @@ mod series;
 pub(crate) mod table;
 
 pub(crate) use anonymous::anonymous;
+pub use instance::{InstanceNames, instance};
 pub(crate) use segments::{is_segmentation, labels};
 
 use super::report::Acquisition;

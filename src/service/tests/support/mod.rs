@@ -9,6 +9,8 @@ use serde_json::Value;
 use service::{Auth, Config, Server};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
@@ -67,12 +69,22 @@ pub struct Service {
     pub folder: TempDir,
 }
 
+/// The interpreter itself: a job's process has no PATH, by which a wrapper would find it.
+fn python() -> PathBuf {
+    static PYTHON: OnceLock<PathBuf> = OnceLock::new();
+    let ask = || {
+        let said = Command::new("python3").args(["-c", "import sys; print(sys.executable)"]).output().unwrap();
+        PathBuf::from(String::from_utf8(said.stdout).unwrap().trim())
+    };
+    PYTHON.get_or_init(ask).clone()
+}
+
 pub fn config(folder: &Path) -> Config {
     Config {
         data_dir: folder.join("data"),
         listen: SocketAddr::from(([127, 0, 0, 1], 0)),
         auth: Auth::None,
-        executable: PathBuf::from("python3"),
+        executable: python(),
         executable_args: vec![script(folder).to_string_lossy().into_owned()],
         ..Config::default()
     }
