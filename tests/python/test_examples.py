@@ -150,6 +150,7 @@ def everything(bench):
     whole = bench.session.post(bench.address + "/v1/jobs", files=files, timeout=60).json()["id"]
     failing = bench.send("create_job", media="multipart/form-data").json()["id"]
     waiting = bench.send("create_job", media="multipart/form-data", **{"Idempotency-Key": "another"}).json()["id"]
+    assert bench.send("prioritise_job", id=waiting).json()["priority"] == 10
     assert bench.send("cancel_job", id=waiting).json()["state"] == "cancelled"
     bench.send("cancel_jobs")
     assert ended(bench, whole)["state"] == "succeeded"
@@ -181,6 +182,14 @@ def everything(bench):
     bench.send("list_webhooks")
     bench.send("delete_webhook", id=hook)
     bench.send("list_workers")
+    bench.send("read_session")
+    bench.send("read_plan", id=whole)
+    bench.send("create_link", id=whole)
+    key = bench.send("create_key", media="application/json").json()["id"]
+    bench.send("list_keys")
+    bench.send("revoke_key", id=key)
+    bench.send("change_tenant", media="application/json")
+    bench.send("read_tenant")
     bench.send("read_audit")
     for job in (named, whole):
         bench.send("erase_job", id=job)
