@@ -400,6 +400,12 @@ pub struct Understood {
 /// [`Failure`] of the plan or of reading.
 pub fn validate(inputs: &[PathBuf], plan: &Plan, ctx: &Ctx) -> Result<Understood, Failure> {
     refuse_unmade(plan)?;
+    if plan.variant.is_some() {
+        let message = "a variant is checked when it is made: leave `variant` out to have a scan checked";
+        let mut failure = Failure::new(FaultKind::Input, "plan.unsupported", message.to_owned());
+        failure.place = space::Place::field("variant");
+        return Err(failure);
+    }
     let (stack, input) = artefact::read::stack(inputs, plan, &Limits::default()).map_err(|e| Failure::of(&e))?;
     Ok(segmented(stack, input, plan, ctx))
 }

@@ -55,7 +55,8 @@ pub(super) struct FromJob {
     /// The job; it keeps its own result.
     #[schema(value_type = Uuid)]
     job: String,
-    /// plan.json; the earlier job's without.
+    /// plan.json; the earlier job's without. With `variant` the new job changes the medial lines of the earlier one's
+    /// result and needs no scan.
     #[schema(value_type = Option<Object>)]
     plan: Option<Value>,
 }
@@ -119,7 +120,11 @@ fn plan_text(state: &State, plan: Option<Value>) -> Result<Option<String>, Probl
 /// The scan of an earlier job, as it lies in the store: it was de-identified when it came.
 async fn of_job(state: &State, who: &Principal, named: FromJob) -> Result<Taken, Problem> {
     let (id, row) = job_of(state, who, &named.job).await?;
+    let variant = named.plan.as_ref().is_some_and(|plan| plan.get("variant").is_some_and(|v| !v.is_null()));
     let plan = plan_text(state, named.plan)?.unwrap_or_else(|| row.plan.clone());
+    if variant {
+        return variant_of(state, id, plan).await;
+    }
     if row.state == JobState::Cancelled {
         let detail = "A cancelled job's scan is erased: send the scan again.";
         return Err(Problem::new(StatusCode::CONFLICT, "job.no_input", detail));
@@ -128,6 +133,21 @@ async fn of_job(state: &State, who: &Principal, named: FromJob) -> Result<Taken,
     budget.grow(state, usize::try_from(row.input_bytes).map_err(Problem::internal)?)?;
     let files = state.store.input(id, &row.input_digest).await?;
     Ok(Taken { plan, files, upload: None, budget })
+}
+
+/// The artefact from which variants of a result are made.
+const SECTIONS: &str = "sections.json";
+
+/// A variant is made from the sections of a finished job, not from its scan.
+async fn variant_of(state: &State, job: Uuid, plan: String) -> Result<Taken, Problem> {
+    let found = state.queue.artefact(job, SECTIONS).await?.ok_or_else(|| {
+        let detail = "A variant is made from the sections.json of a job that has succeeded; this one has none.";
+        Problem::new(StatusCode::CONFLICT, "job.no_result", detail)
+    })?;
+    let mut budget = Budget::default();
+    budget.grow(state, usize::try_from(found.bytes).map_err(Problem::internal)?)?;
+    let bytes = state.store.bytes(&found.object_key, &found.digest).await?;
+    Ok(Taken { plan, files: vec![(SECTIONS.to_owned(), bytes.to_vec())], upload: None, budget })
 }
 
 /// Whether the body is JSON.

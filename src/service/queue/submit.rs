@@ -212,7 +212,7 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
     }
     let insert = "INSERT INTO job (id, tenant, kind, state, priority, plan, input_digest, input_files, input_bytes, \
         memory_mb, trace_id, idempotency_key, rank, run_at, created_at) \
-        VALUES ($1, $2, 'reconstruction', 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms()) \
+        VALUES ($1, $2, $12, 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms()) \
         RETURNING *";
     let values = args![
         job.id,
@@ -226,10 +226,17 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
         &job.trace_id,
         &job.idempotency_key,
         job.priority.saturating_mul(AGEING_MS),
+        kind(&job.plan),
     ];
     let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
     record(tx, &job.id.to_string(), "state").await?;
     Ok(Submitted::New(JobRow::of(&row)?.into()))
+}
+
+/// What a job makes: a plan with a `variant` is a re-synthesis.
+fn kind(plan: &str) -> &'static str {
+    let asked = serde_json::from_str::<serde_json::Value>(plan).is_ok_and(|p| !p["variant"].is_null());
+    if asked { "variant" } else { "reconstruction" }
 }
 
 /// Cancels a queued job, asks for the end of a running one, leaves others alone.

@@ -223,12 +223,9 @@ impl Store {
     /// # Errors
     /// The store's; a digest that does not match.
     pub async fn input(&self, job: Uuid, wanted: &str) -> Result<Vec<(String, Vec<u8>)>, Error> {
-        let manifest = self.verified(&input_key(job, "manifest.json"), wanted).await?;
-        let files: Vec<InputFile> =
-            serde_json::from_slice(&manifest).map_err(|source| Error::Manifest { job, source })?;
-        let mut read = Vec::with_capacity(files.len());
-        for (i, file) in files.into_iter().enumerate() {
-            let bytes = self.verified(&input_key(job, &format!("{i:06}")), &file.digest).await?;
+        let mut read = Vec::new();
+        for file in self.manifest(job, wanted).await? {
+            let bytes = self.verified(&input_key(job, &file.digest), &file.digest).await?;
             read.push((file.name, bytes.into()));
         }
         Ok(read)

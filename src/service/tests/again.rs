@@ -20,7 +20,7 @@ async fn a_scan_is_reconstructed_again_with_another_plan_without_being_sent_agai
     let second = body(again(json!({"job": first, "plan": {"note": "second"}})).await.unwrap()).await;
     let third = body(again(json!({"job": first})).await.unwrap()).await;
     for (job, note) in [(&second, "second"), (&third, "first")] {
-        let id = job["id"].as_str().unwrap();
+        let id = job["id"].as_str().unwrap_or_else(|| panic!("{job}"));
         assert_eq!(service.ended(id).await["state"], "succeeded");
         assert_eq!(job["input"]["digest"], done["input"]["digest"]);
         assert_eq!(service.json(&format!("/v1/jobs/{id}/plan")).await["note"], note);
@@ -34,6 +34,26 @@ async fn a_scan_is_reconstructed_again_with_another_plan_without_being_sent_agai
     assert_eq!(service.ended(fourth["id"].as_str().unwrap()).await["state"], "succeeded");
     let odd = again(json!({"job": second["id"], "plam": {}})).await.unwrap();
     assert_eq!(problem(odd, 422).await, "bad_request");
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_variant_is_made_from_the_sections_of_a_finished_job() {
+    let service = Service::start().await;
+    let vary = |job: &str| {
+        let wanted = json!({"job": job, "plan": {"variant": {"changes": []}}});
+        service.request(Method::POST, "/v1/jobs").json(&wanted).send()
+    };
+    let without = service.submit(&json!({})).await;
+    service.ended(&without).await;
+    assert_eq!(problem(vary(&without).await.unwrap(), 409).await, "job.no_result");
+    let first = service.submit(&json!({"sections": true})).await;
+    assert_eq!(service.ended(&first).await["kind"], "reconstruction");
+    let made = body(vary(&first).await.unwrap()).await;
+    assert_eq!(made["kind"], "variant");
+    let id = made["id"].as_str().unwrap();
+    assert_eq!(service.ended(id).await["state"], "succeeded");
+    assert_eq!(service.json(&format!("/v1/jobs/{id}/result")).await["files"], json!(["sections.json"]));
     service.stop().await;
 }
 
