@@ -1,12 +1,15 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
-use crate::{shell, storm, survey, tools};
+use crate::{drawn, shell, storm, survey, tools};
 use anyhow::{Result, bail};
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Noise seeds of the demo scan that the test command reconstructs (the survey runs ten).
 const SEEDS: u64 = 3;
+
+/// Random vessels and scans, none of which may come out wrong without a word (the whole survey takes 1,000).
+const DRAWN: u64 = 25;
 
 /// Random vessels whose surfaces another program judges (the whole survey takes 200).
 const SURFACES: &str = "20";
@@ -28,6 +31,7 @@ pub(crate) fn all() -> Result<()> {
     let work = fresh_folder()?;
     judges(&binary, &work)?;
     survey::run(&binary, 1, SEEDS)?;
+    drawn::run(&binary, 1, DRAWN)?;
     storm::short()?;
     fs::remove_dir_all(&work)?;
     eprintln!("xtask: all checks passed");
