@@ -5,7 +5,7 @@
 
 use crate::arguments::Vary;
 use crate::jobs::{Shown, context, plan_of, report, summary};
-use artefact::plan::{Branch, Plan, Variant, VariantChange};
+use artefact::plan::{Branch, Plan, ROLES, Variant, VariantChange};
 use pipeline::Failure;
 use serde_json::json;
 use std::process::ExitCode;
@@ -130,7 +130,7 @@ fn branch_of(name: &str) -> Branch {
 fn change_of(option: &str, name: &str) -> Result<VariantChange, Failure> {
     let branch = branch_of(name);
     if let Branch::Role(role) = &branch
-        && !["graft", "proximal", "distal", "host_a", "host_b"].contains(&role.as_str())
+        && !ROLES.contains(&role.as_str())
     {
         return Err(refused(&format!(
             "--{option} {name}: no such branch; give graft, proximal, distal, host_a, host_b or a number"

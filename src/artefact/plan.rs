@@ -9,7 +9,7 @@ mod convert;
 mod tests;
 mod variant;
 
-pub use check::{PlanFault, PlanFaults};
+pub use check::{PlanFault, PlanFaults, ROLES};
 
 use serde::{Deserialize, Serialize};
 

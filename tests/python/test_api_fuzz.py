@@ -14,6 +14,7 @@ import sys
 import tempfile
 import urllib.request
 
+from shared.serving import serve
 HOOKS = '''
 import os
 import urllib.request
@@ -98,26 +99,11 @@ expected-statuses = [400, 401, 403, 404, 406, 412, 415, 422]
 """
 
 
-def start(binary, folder):
-    process = subprocess.Popen(
-        [binary, "serve", "--listen", "127.0.0.1:0", "--data-dir", str(folder / "data"), "--webhook-host", "127.0.0.1"],
-        stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, env={**os.environ, "RUST_LOG": "error"},
-    )
-    address = key = None
-    for line in process.stdout:
-        address = address or (line.split()[-1] if line.startswith("listening on ") else None)
-        found = re.search(r"vsk_[0-9a-f]+", line)
-        key = key or (found and found.group())
-        if address and key:
-            return process, address, key
-    sys.exit("the service did not start")
-
-
 def main():
     root = pathlib.Path(os.environ["VASCULUM_ROOT"]) if "VASCULUM_ROOT" in os.environ else pathlib.Path(__file__).parents[2]
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        process, address, key = start(os.environ["VASCULUM_BIN"], folder)
+        process, address, key = serve(folder / "data", "--webhook-host", "127.0.0.1", stdin=subprocess.DEVNULL, env={**os.environ, "RUST_LOG": "error"})
         try:
             (folder / "hooks.py").write_text(HOOKS)
             (folder / "schemathesis.toml").write_text(SETTINGS)

@@ -17,6 +17,7 @@ import time
 import jsonschema
 import requests
 import yaml
+from shared.serving import serve
 
 
 
@@ -32,21 +33,6 @@ document = yaml.load((pathlib.Path(os.environ["VASCULUM_ROOT"]) / "openapi.yaml"
 scan = pathlib.Path(os.environ["VASCULUM_SCAN"])
 slices = sorted((scan / "dicom").glob("*.dcm"))
 STUDY = re.search(rb"\x20\x00\x0d\x00UI..([0-9.]+)", slices[0].read_bytes()).group(1).decode()
-
-
-def serve(folder):
-    process = subprocess.Popen(
-        [os.environ["VASCULUM_BIN"], "serve", "--listen", "127.0.0.1:0", "--data-dir", str(folder), "--webhook-host", "127.0.0.1"],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    )
-    address = key = None
-    for line in process.stdout:
-        address = address or (line.split()[-1] if line.startswith("listening on ") else None)
-        found = re.search(r"vsk_[0-9a-f]+", line)
-        key = key or (found and found.group())
-        if address and key:
-            return process, address, key
-    sys.exit("the service did not start")
 
 
 def fits(value, schema):
@@ -198,7 +184,7 @@ def everything(bench):
 def main():
     count = written()
     with tempfile.TemporaryDirectory() as folder:
-        process, address, key = serve(folder)
+        process, address, key = serve(folder, "--webhook-host", "127.0.0.1", stderr=subprocess.DEVNULL)
         try:
             bench = Bench(address, key)
             everything(bench)

@@ -8,7 +8,6 @@ import io
 import json
 import os
 import pathlib
-import re
 import shutil
 import socket
 import subprocess
@@ -21,6 +20,7 @@ import zipfile
 import dicomweb_client
 import pydicom
 import requests
+from shared.serving import serve
 
 scan = pathlib.Path(os.environ["VASCULUM_SCAN"])
 slices = sorted((scan / "dicom").glob("*.dcm"))
@@ -31,21 +31,6 @@ def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def serve(folder):
-    process = subprocess.Popen(
-        [os.environ["VASCULUM_BIN"], "serve", "--listen", "127.0.0.1:0", "--data-dir", str(folder / "data"), "--stow-quiet-seconds", "3"],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    )
-    address = key = None
-    for line in process.stdout:
-        address = address or (line.split()[-1] if line.startswith("listening on ") else None)
-        found = re.search(r"vsk_[0-9a-f]+", line)
-        key = key or (found and found.group())
-        if address and key:
-            return process, address, key
-    sys.exit("the service did not start")
 
 
 def plugin():
@@ -131,7 +116,7 @@ def from_client(session, address):
 def main():
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        service, address, key = serve(folder)
+        service, address, key = serve(folder / "data", "--stow-quiet-seconds", "3", stderr=subprocess.DEVNULL)
         pacs = None
         try:
             session = requests.Session()

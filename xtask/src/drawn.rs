@@ -3,6 +3,7 @@
 //! A scan is right when graph, angles and areas lie within three times the accuracy promised for its resolution. One that
 //! is not must have been refused, or warned of; the survey fails when one is wrong and silent.
 
+use crate::survey::{ANGLES, area_biases};
 use crate::{shell, tools};
 use anyhow::{Context, Result, bail, ensure};
 use serde_json::Value;
@@ -10,8 +11,6 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-/// Angles that are compared.
-const ANGLES: [&str; 3] = ["graft_proximal", "graft_distal_planar", "distal_normal"];
 /// Three times the promise at .5 x .5 x 1.5 mm and SNR 20: degrees, percent of area.
 const FINE: Bounds = Bounds { angle_deg: 0.9, area_percent: 2.4 };
 /// The same at .7 x .7 x 3 mm and SNR 10, which stands for all scans coarser than that.
@@ -116,11 +115,7 @@ fn judge(result: &Value, truth: &Value) -> Result<(End, String)> {
             None => line += "null ",
         }
     }
-    for branch in result["branches"].as_array().map(Vec::as_slice).unwrap_or_default() {
-        let role = branch["role"].as_str().unwrap_or_default();
-        let Some(radius) = truth["radii_mm"][role].as_f64() else { continue };
-        let Some(diameter) = branch["diameter_mm"].as_f64() else { continue };
-        let bias = 100.0 * ((0.5 * diameter / radius).powi(2) - 1.0);
+    for (role, bias) in area_biases(result, truth) {
         line += &format!("{role} {bias:+.1}% ");
         if bias.abs() > bounds.area_percent {
             wrong.push(format!("area of {role} {bias:+.1} %"));

@@ -11,7 +11,7 @@ const ANGLE_DEG: f64 = 1.0;
 /// Smallest angle of a triangle, degrees.
 const TRIANGLE_DEG: f64 = 25.0;
 /// Angles that are compared.
-const ANGLES: [&str; 3] = ["graft_proximal", "graft_distal_planar", "distal_normal"];
+pub(crate) const ANGLES: [&str; 3] = ["graft_proximal", "graft_distal_planar", "distal_normal"];
 
 /// Reconstruct `count` scans and compare; any scan beyond the bounds is an error.
 pub(crate) fn run(binary: &Path, first: u64, count: u64) -> Result<()> {
@@ -106,13 +106,18 @@ fn compare(result: &Value, truth: &Value) -> Result<Row> {
     Ok(Row { line, faults, in_band })
 }
 
-/// Area bias of every branch in percent: median section outside the junction against the truth's radius.
-fn area_bias(result: &Value, truth: &Value) -> String {
+/// Role and area bias in percent of every branch: median section outside the junction against the truth's radius.
+pub(crate) fn area_biases(result: &Value, truth: &Value) -> Vec<(String, f64)> {
     let branches = result["branches"].as_array().map(Vec::as_slice).unwrap_or_default();
-    let biases = branches.iter().filter_map(|b| {
+    let bias = |b: &Value| {
         let role = b["role"].as_str()?;
         let (diameter, radius) = (b["diameter_mm"].as_f64()?, truth["radii_mm"][role].as_f64()?);
-        Some(format!("{role} {:+.2}", 100.0 * ((0.5 * diameter / radius).powi(2) - 1.0)))
-    });
-    biases.collect::<Vec<_>>().join(" ")
+        Some((role.to_owned(), 100.0 * ((0.5 * diameter / radius).powi(2) - 1.0)))
+    };
+    branches.iter().filter_map(bias).collect()
+}
+
+fn area_bias(result: &Value, truth: &Value) -> String {
+    let shown = area_biases(result, truth).into_iter().map(|(role, bias)| format!("{role} {bias:+.2}"));
+    shown.collect::<Vec<_>>().join(" ")
 }

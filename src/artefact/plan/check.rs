@@ -153,7 +153,7 @@ const CHANGE: &[(&str, Rule)] = &[
 ];
 
 /// Roles that a change may name.
-const ROLES: &[&str] = &["graft", "proximal", "distal", "host_a", "host_b"];
+pub const ROLES: &[&str] = &["graft", "proximal", "distal", "host_a", "host_b"];
 /// Most changes of a variant.
 const MAX_CHANGES: usize = 100;
 

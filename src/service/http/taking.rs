@@ -9,6 +9,7 @@ use crate::config::NamedBytes;
 use crate::error::Problem;
 use crate::intake::intake;
 use crate::queue::JobState;
+use crate::queue::submit::is_variant;
 use crate::state::State;
 use axum::body::{Body, to_bytes};
 use axum::extract::{FromRequest as _, Multipart, Request};
@@ -120,11 +121,11 @@ fn plan_text(state: &State, plan: Option<Value>) -> Result<Option<String>, Probl
 /// The scan of an earlier job, as it lies in the store: it was de-identified when it came.
 async fn of_job(state: &State, who: &Principal, named: FromJob) -> Result<Taken, Problem> {
     let (id, row) = job_of(state, who, &named.job).await?;
-    let variant = named.plan.as_ref().is_some_and(|plan| plan.get("variant").is_some_and(|v| !v.is_null()));
-    let plan = plan_text(state, named.plan)?.unwrap_or_else(|| row.plan.clone());
-    if variant {
-        return variant_of(state, id, plan).await;
+    let asked = plan_text(state, named.plan)?;
+    if let Some(plan) = asked.as_ref().filter(|plan| is_variant(plan)) {
+        return variant_of(state, id, plan.clone()).await;
     }
+    let plan = asked.unwrap_or_else(|| row.plan.clone());
     if row.state == JobState::Cancelled {
         let detail = "A cancelled job's scan is erased: send the scan again.";
         return Err(Problem::new(StatusCode::CONFLICT, "job.no_input", detail));

@@ -226,17 +226,16 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
         &job.trace_id,
         &job.idempotency_key,
         job.priority.saturating_mul(AGEING_MS),
-        kind(&job.plan),
+        if is_variant(&job.plan) { "variant" } else { "reconstruction" },
     ];
     let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
     record(tx, &job.id.to_string(), "state").await?;
     Ok(Submitted::New(JobRow::of(&row)?.into()))
 }
 
-/// What a job makes: a plan with a `variant` is a re-synthesis.
-fn kind(plan: &str) -> &'static str {
-    let asked = serde_json::from_str::<serde_json::Value>(plan).is_ok_and(|p| !p["variant"].is_null());
-    if asked { "variant" } else { "reconstruction" }
+/// Whether a plan asks for a re-synthesis in place of a scan's reconstruction.
+pub(crate) fn is_variant(plan: &str) -> bool {
+    serde_json::from_str::<serde_json::Value>(plan).is_ok_and(|p| !p["variant"].is_null())
 }
 
 /// Cancels a queued job, asks for the end of a running one, leaves others alone.
