@@ -32,7 +32,7 @@ impl Server {
         let folder = TempDir::new().unwrap();
         fs::create_dir(folder.path().join("tmp")).unwrap();
         let log = fs::File::create(folder.path().join("log")).unwrap();
-        let (process, address) = serving::serve(&folder.path().join("data"), |command| {
+        let (process, address) = serving::serve(Path::new(BINARY), &folder.path().join("data"), |command| {
             command.args(["--stow-quiet-seconds", "0"]);
             command.env("RUST_LOG", "trace").env("TMPDIR", folder.path().join("tmp")).stderr(log);
         });

@@ -153,7 +153,7 @@ struct Server {
 impl Server {
     fn start(data: &Path) -> Self {
         service::tls::provide();
-        let (process, address) = serving::serve(data, |_| ());
+        let (process, address) = serving::serve(Path::new(BINARY), data, |_| ());
         Self { process, address, data: data.to_owned() }
     }
     fn kill(mut self) {

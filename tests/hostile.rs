@@ -33,7 +33,7 @@ struct Server {
 impl Server {
     fn start() -> Self {
         let data = TempDir::new().unwrap();
-        let (process, address) = serving::serve(data.path(), |_| ());
+        let (process, address) = serving::serve(env!("CARGO_BIN_EXE_vasculum").as_ref(), data.path(), |_| ());
         let address = address.trim_start_matches("http://").to_owned();
         Self { process, address, _data: data }
     }

@@ -73,7 +73,10 @@ async fn looked_at(command: impl FnOnce(&mut Command)) {
     let made = Command::new(BINARY).args(["phantom", "anastomosis", "--out"]).arg(&scan).output().unwrap();
     assert!(made.status.success());
     let data = folder.path().join("data");
-    let (server, address) = serving::serve(&data, |serve| {
+    // The target folder may lie in a home that only its owner may enter.
+    let binary = folder.path().join("vasculum");
+    fs::copy(BINARY, &binary).unwrap();
+    let (server, address) = serving::serve(&binary, &data, |serve| {
         serve.env("VASCULUM_S3_SECRET_ACCESS_KEY", "hush").env("DATABASE_PASSWORD", "hush");
         command(serve);
     });

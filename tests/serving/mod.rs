@@ -4,10 +4,10 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-/// `vasculum serve` without keys on the folder `data`, with what `configure` adds to the command, once it listens: the
-/// process and its address.
-pub(crate) fn serve(data: &Path, configure: impl FnOnce(&mut Command)) -> (Child, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_vasculum"));
+/// `vasculum serve` of this binary without keys on the folder `data`, with what `configure` adds to the command, once it
+/// listens: the process and its address.
+pub(crate) fn serve(binary: &Path, data: &Path, configure: impl FnOnce(&mut Command)) -> (Child, String) {
+    let mut command = Command::new(binary);
     command.args(["serve", "--no-auth", "--listen", "127.0.0.1:0", "--data-dir"]).arg(data);
     command.env("RUST_LOG", "error").stdout(Stdio::piped()).stdin(Stdio::null());
     configure(&mut command);
