@@ -1,7 +1,7 @@
 //! Noisy closed polylines to smooth periodic curves, the point spread, and the half-maximum correction.
 //!
-//! Periodic cubic P-spline: uniform B-splines over arc length, third-difference penalty, smoothing by generalised
-//! cross-validation with every degree of freedom counted 1.6 times, because neighbouring crossings share pixels and
+//! Periodic cubic P-spline: uniform B-splines over arc length, a third-order penalty that is 0 for circles, smoothing by
+//! generalised cross-validation with every degree of freedom counted 1.6 times, because neighbouring crossings share pixels and
 //! plain GCV follows their common noise. The parameters of the data are their feet on the last curve, three rounds.
 //! The half-maximum contour of a blurred convex lumen lies inside the wall: each point is moved outward by
 //! kappa/2 det(Sigma)/(n' Sigma n), which is kappa/2 (sigma^2 + px^2/12) for square pixels.
@@ -18,22 +18,21 @@ pub(crate) struct Smoothed {
     pub(crate) standard_error: f64,
 }
 
-/// Inflation of the degrees of freedom in GCV, usually 1.4 (Gu). Discs of 10 px at SNR 10/20/30 reach .19/.084/.054 px
-/// rms at 1.15, .060/.034/.024 at 1.4 and .053/.028/.020 at 1.6; peanuts of 5 px at SNR 20 reach .086 at 1.3, .082 at
-/// 1.4 and .079 at 1.6: neighbouring crossings share pixels, and what they share is not shape.
+/// Inflation of the degrees of freedom in GCV, usually 1.4 (Gu). Discs of 10 px at SNR 10/20/30 reach .070/.042/.026 px
+/// rms at 1.3, .050/.026/.016 at 1.45, .046/.022/.016 at 1.6 and .045/.022/.015 at 1.8; peanuts of 5 px at SNR 20 reach
+/// .089, .082, .080 and .081: neighbouring crossings share pixels, and what they share is not shape.
 const INFLATION: f64 = 1.6;
-/// Data points per knot: marching squares give 1.27 points per pixel of arc, so that knots are 1.2 px apart. Peanut shapes
-/// are 1 to 4 % worse at 2 points than at 1.3; discs do not care.
-const POINTS_PER_KNOT: f64 = 1.5;
+/// Data points per knot: marching squares give 1.27 points per pixel of arc, so that knots are 1 px apart. Peanut shapes
+/// are up to 1 % worse at 1.5 points and up to 4 % at 2; discs do not care.
+const POINTS_PER_KNOT: f64 = 1.3;
 /// Knots, least and most (the dense solve costs their cube / 6).
 const KNOTS: (usize, usize) = (12, 160);
 /// Rounds of fit and new parameters.
 const ROUNDS: usize = 3;
 /// Neighbouring crossings share noise: the variance of the mean is this many times that of independent points. With it
 /// the stated standard error is within 10 % of the true rms of discs of 5 to 10 px at SNR 10 to 30. It is a variance: what
-/// smoothing takes off a waist is not in it, so that peanuts of 5, 7.5, 10 px at SNR 20 err by 1.54, 1.40, 1.32 times it.
-/// Adding the square of what a second smoothing takes off was tried: 1.45, 1.33, 1.25, and discs overstated by 7 %.
-const SHARED_NOISE: f64 = 1.7;
+/// smoothing takes off a waist is not in it, so that peanuts of 5, 7.5, 10 px at SNR 20 err by 1.35, 1.22, 1.16 times it.
+const SHARED_NOISE: f64 = 2.2;
 
 /// The smoothing spline of a closed line.
 pub(crate) fn smoothed(line: &Line) -> Smoothed {
@@ -153,12 +152,23 @@ fn residual(control: &[[f64; 2]], i: usize, w: &[f64; 4], p: &[f64; 2]) -> f64 {
     off[0] * off[0] + off[1] * off[1]
 }
 
-/// Solves (A + lambda D'D) c = b with D the cyclic third difference, by Cholesky.
+/// Roughness whose null space holds circles: per frequency w of the control points z (z - z_1)^2 with z = 2 - 2 cos w and z_1 that of
+/// one turn per circuit. It is the third difference's z^3 for all shapes finer than that, which takes a little off every circle's radius.
+fn roughness(k: usize) -> [f64; 4] {
+    let one = first_frequency(k);
+    [20.0 - 12.0 * one + 2.0 * one * one, -15.0 + 8.0 * one - one * one, 6.0 - 2.0 * one, -1.0]
+}
+
+fn first_frequency(k: usize) -> f64 {
+    2.0 - 2.0 * (std::f64::consts::TAU / k as f64).cos()
+}
+
+/// Solves (A + lambda R) c = b with R the cyclic [`roughness`], by Cholesky.
 fn penalised(a: &[f64], b: &[[f64; 2]], k: usize, lambda: f64) -> Vec<[f64; 2]> {
-    // D'D has the symbol (2 - 2 cos)^3: coefficients 20, -15, 6, -1
+    let rough = roughness(k);
     let mut m = a.to_vec();
     for i in 0..k {
-        for (d, c) in [20.0, -15.0, 6.0, -1.0].into_iter().enumerate() {
+        for (d, c) in rough.into_iter().enumerate() {
             m[i * k + (i + d) % k] += lambda * c;
             if d > 0 {
                 m[i * k + (i + k - d) % k] += lambda * c;
@@ -195,7 +205,7 @@ fn penalised(a: &[f64], b: &[[f64; 2]], k: usize, lambda: f64) -> Vec<[f64; 2]> 
 /// frequencies of a/(a + lambda p). Marching squares points
 /// are even enough for the choice of lambda.
 fn degrees_of_freedom(n: f64, k: usize, lambda: f64) -> f64 {
-    let per_knot = n / k as f64;
+    let (per_knot, one) = (n / k as f64, first_frequency(k));
     (0..k)
         .map(|f| {
             let w = std::f64::consts::TAU * f as f64 / k as f64;
@@ -203,7 +213,8 @@ fn degrees_of_freedom(n: f64, k: usize, lambda: f64) -> f64 {
             let c = [2416.0, 1191.0, 120.0, 1.0];
             let g = (c[0] + 2.0 * (c[1] * w.cos() + c[2] * (2.0 * w).cos() + c[3] * (3.0 * w).cos())) / 5040.0;
             let a = per_knot * g.max(1e-12);
-            a / (a + lambda * (2.0 - 2.0 * w.cos()).powi(3))
+            let z = 2.0 - 2.0 * w.cos();
+            a / (a + lambda * z * (z - one).powi(2))
         })
         .sum()
 }
@@ -254,4 +265,22 @@ pub(crate) fn normal_cdf(x: f64) -> f64 {
     let poly = [0.254_829_592, -0.284_496_736, 1.421_413_741, -1.453_152_027, 1.061_405_429];
     let erf = 1.0 - poly.iter().rev().fold(0.0, |s, c| (s + c) * t) * (-z * z).exp();
     0.5 * (1.0 + if x < 0.0 { -erf } else { erf })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_smoothing_takes_anything_off_a_circle() {
+        for k in [12, 31, 90] {
+            let at = |i: usize| std::f64::consts::TAU * i as f64 / k as f64;
+            let circle: Vec<[f64; 2]> = (0..k).map(|i| [3.0 * at(i).cos() + 7.0, 3.0 * at(i).sin() - 2.0]).collect();
+            let mut identity = vec![0.0; k * k];
+            (0..k).for_each(|i| identity[i * k + i] = 1.0);
+            let control = penalised(&identity, &circle, k, 1e4);
+            let off = control.iter().zip(&circle).map(|(c, p)| (c[0] - p[0]).hypot(c[1] - p[1])).fold(0.0, f64::max);
+            assert!(off < 1e-5, "{k} knots: {off}");
+        }
+    }
 }

@@ -73,8 +73,8 @@ const GRAZING: f64 = 0.1;
 /// (|f| / |grad f| <= 1e-9 mm) and in their plane (1e-12 mm). Caps hold only rim vertices until [`crate::remesh`].
 ///
 /// # Errors
-/// [`Error::GrazingCut`], [`Error::NestedRims`], [`Error::CrossedRim`], [`Error::NothingLeft`], [`Error::Projection`],
-/// [`Error::Defect`], [`Error::Settings`] (a normal of length zero), [`Error::Cancelled`].
+/// [`Error::GrazingCut`], [`Error::NestedRims`], [`Error::CrossedRim`], [`Error::CutRunsOn`], [`Error::NothingLeft`],
+/// [`Error::Projection`], [`Error::Defect`], [`Error::Settings`] (a normal of length zero), [`Error::Cancelled`].
 pub fn cut(mesh: &TriMesh, field: &dyn Field, cuts: &[CutPlane], ctx: &Ctx) -> Result<(TriMesh, CutReport), Error> {
     let mut flats = Vec::with_capacity(cuts.len());
     for c in cuts {
@@ -138,6 +138,9 @@ fn one(mesh: &TriMesh, field: &dyn Field, flats: &[Flat], k: usize, ctx: &Ctx) -
     let mut number = BTreeMap::new();
     for h in crossed {
         let (a, b) = (web.origin[h as usize] as usize, web.target(h) as usize);
+        if height[a] == f64::NEG_INFINITY {
+            return Err(Error::CutRunsOn { plane: k, reach_mm: plane.reach, at: P3::from_raw(web.at[b]) });
+        }
         let place = web.at[a].lerp(web.at[b], height[a] / (height[a] - height[b]));
         number.insert(h, clipped.mesh.vertices.len() as u32);
         clipped.mesh.vertices.push(P3::from_raw(place - plane.normal * plane.height(place)));

@@ -119,6 +119,19 @@ pub enum Error {
         /// Where.
         at: P3,
     },
+    /// A local cut takes a part of the wall that runs on out of its reach.
+    #[error(
+        "what lies past cut plane {plane} runs on out of the cut's reach of {reach_mm:.1} mm: another vessel passes there; \
+         move the cut away from it"
+    )]
+    CutRunsOn {
+        /// Plane number in the order given.
+        plane: usize,
+        /// Reach of the cut, mm.
+        reach_mm: f64,
+        /// Where the wall leaves the reach.
+        at: P3,
+    },
     /// Nothing is left inside the cut planes.
     #[error("cut plane {plane} removes the whole surface: its outward normal probably points the wrong way")]
     NothingLeft {
@@ -238,6 +251,7 @@ impl Faulty for Error {
             Self::GrazingCut { .. } => "surface.grazing_cut",
             Self::NestedRims { .. } => "surface.nested_rims",
             Self::CrossedRim { .. } => "surface.crossed_rim",
+            Self::CutRunsOn { .. } => "surface.cut_runs_on",
             Self::NothingLeft { .. } => "surface.nothing_left",
             Self::CapPlane { .. } => "surface.cap_plane",
             Self::TooManyTriangles { .. } => "surface.too_many_triangles",
@@ -256,6 +270,7 @@ impl Faulty for Error {
             | Self::GrazingCut { at, .. }
             | Self::NestedRims { at, .. }
             | Self::CrossedRim { at, .. }
+            | Self::CutRunsOn { at, .. }
             | Self::NothingLeft { at, .. }
             | Self::CapPlane { at, .. }
             | Self::ObliqueEnd { at, .. }

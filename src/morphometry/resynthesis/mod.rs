@@ -131,12 +131,13 @@ pub struct Resynthesis {
 /// # Errors
 /// [`Error::VariantBranch`] (no such branch, or several), [`Error::VariantLoop`], [`Error::VariantDirection`],
 /// [`Error::VariantValue`], [`Error::VariantSections`] (a branch without clear sections), [`Error::VariantFolds`]
-/// where r kappa >= 1, [`Error::VariantCollision`] where lumens meet that were apart.
+/// where r kappa >= 1, [`Error::VariantCollision`] where lumens meet that were apart, or an open end lies too
+/// close to another vessel to be cut.
 pub fn resynthesise(model: &Model, changes: &[Change]) -> Result<Resynthesis, Error> {
     let changed = change::applied(model, changes)?;
     let tubes = rings::tubes(model, &changed)?;
     let walls = rings::walls(model, &tubes)?;
-    let contours = rings::contours(model, &tubes, &walls);
+    let contours = rings::contours(model, &tubes, &walls)?;
     Ok(Resynthesis { contours, roles: roles(model, &tubes) })
 }
 

@@ -19,8 +19,10 @@ const SPACING_RADII: f64 = 0.4;
 const BLEND_RADII: f64 = 0.1;
 /// Standard error of the curves, in pixels: the sections are those of a smooth function, not of pixels.
 const ERROR_PX: f64 = 0.01;
-/// A cut reaches this many pixels past the longest ray of its section: four are meshed past the plane.
+/// A cut reaches this many pixels past the longest ray of its section, or as far as the next vessel's wall allows.
 const CUT_REACH_PX: f64 = 6.0;
+/// So many pixels past its plane are meshed before they are cut away: the least that a cut must reach.
+const MESHED_PX: f64 = 4.0;
 
 /// A section in space.
 #[derive(Clone, Debug)]
@@ -272,7 +274,7 @@ fn near_overlap(overlaps: &[bool], k: usize) -> bool {
 const LEAST_POINTS: usize = 6;
 
 /// The wall as closed planar curves, one plane per ring, cut at the last ring of each open end.
-pub(crate) fn contours(model: &Model, tubes: &[Tube], walls: &Walls) -> Contours {
+pub(crate) fn contours(model: &Model, tubes: &[Tube], walls: &Walls) -> Result<Contours, Error> {
     let mut out = Contours {
         axis: Axis::Slice,
         planes: Vec::new(),
@@ -283,7 +285,8 @@ pub(crate) fn contours(model: &Model, tubes: &[Tube], walls: &Walls) -> Contours
         thickness_mm: None,
         blur: None,
     };
-    for ((branch, tube), wall) in model.branches.iter().zip(tubes).zip(walls) {
+    for (b, (tube, wall)) in tubes.iter().zip(walls).enumerate() {
+        let branch = &model.branches[b];
         let first = out.planes.len();
         for (ring, keep) in tube.rings.iter().zip(wall) {
             if keep.iter().filter(|k| **k).count() >= LEAST_POINTS {
@@ -296,11 +299,11 @@ pub(crate) fn contours(model: &Model, tubes: &[Tube], walls: &Walls) -> Contours
         }
         for (end, plane) in [(0, first), (1, last - 1)] {
             if model.junction(branch.nodes[end]).is_none() {
-                close(branch, tube, end, plane, &mut out);
+                close(model, tubes, (b, end), plane, &mut out)?;
             }
         }
     }
-    out
+    Ok(out)
 }
 
 fn push_ring(ring: &Ring, keep: &[bool], out: &mut Contours) {
@@ -359,15 +362,34 @@ fn hidden(points: &[[f64; 2]], keep: &[bool], length: f64) -> Vec<[f64; 2]> {
 }
 
 /// An open end is cut at its last ring; a blind one closes half a radius past it.
-fn close(branch: &ModelBranch, tube: &Tube, end: usize, plane: usize, out: &mut Contours) {
+fn close(
+    model: &Model,
+    tubes: &[Tube],
+    (b, end): (usize, usize),
+    plane: usize,
+    out: &mut Contours,
+) -> Result<(), Error> {
+    let (branch, rings) = (&model.branches[b], &tubes[b].rings);
     let side = if end == 0 { -1.0 } else { 1.0 };
-    let at = if end == 0 { tube.rings.first() } else { tube.rings.last() };
-    let Some(ring) = at else { return };
+    let Some(ring) = (if end == 0 { rings.first() } else { rings.last() }) else { return Ok(()) };
     let outward = V3::from_raw(ring.frame.z_axis * side);
     let centre = P3::from_raw(ring.centre);
     if branch.tip[end] {
         out.tips.push(tip(plane, centre + outward * (0.5 * ring.mean_radius()), outward));
-    } else {
-        out.cuts.push(CutPlane::new(centre, outward).within(ring.longest() + CUT_REACH_PX * out.pixel_mm));
+        return Ok(());
     }
+    let wanted = ring.longest() + CUT_REACH_PX * out.pixel_mm;
+    let least = ring.longest().hypot(MESHED_PX * out.pixel_mm) + out.pixel_mm;
+    let mut reach = wanted;
+    for (o, other) in tubes.iter().enumerate().filter(|(o, _)| *o != b) {
+        let points = other.rings.iter().flat_map(|r| (0..r.count()).map(|k| r.point(k)));
+        let past = points.filter(|p| (*p - ring.centre).dot(outward.raw()) > -out.pixel_mm);
+        let free = past.fold(f64::INFINITY, |d, p| d.min(p.distance(ring.centre))) - out.pixel_mm;
+        if free < least {
+            return Err(Error::VariantCollision { branch: branch.id, other: model.branches[o].id, at: centre });
+        }
+        reach = reach.min(free);
+    }
+    out.cuts.push(CutPlane::new(centre, outward).within(reach));
+    Ok(())
 }
