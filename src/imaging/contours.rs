@@ -111,7 +111,9 @@ fn found(stack: &Stack, settings: &Settings, ctx: &Ctx) -> Result<(Contours, Rep
         let outline = &drawn[k].outlines[o];
         let drawn_small = interpolation(stack, axis);
         let variance = acquired.map(|b| b.in_plane(&planes[outline.plane]));
-        curve(outline, &smooth[i], o, variance.map(|v| [v[0] + drawn_small[0], v[1] + drawn_small[1]]), stack)
+        let level_error_mm = level_error(&s, axis, (outline, &planes[outline.plane]), variance);
+        let variance = variance.map(|v| [v[0] + drawn_small[0], v[1] + drawn_small[1]]);
+        Curve { level_error_mm, ..curve(outline, &smooth[i], o, variance, stack) }
     })?;
     crate::agreement::widen_errors(&mut curves, &planes);
     let ends = ends(stack, &s, axis, &drawn, &planes);
@@ -160,6 +162,32 @@ fn interpolation(stack: &Stack, axis: Axis) -> [f64; 2] {
     }
 }
 
+/// How far the error of the surroundings' value moves a wall, mm (root mean square along the line): half of it over the slope
+/// of a blurred edge at half height, contrast / (sqrt(2 pi) sigma).
+fn level_error(s: &Segmentation, axis: Axis, (outline, plane): (&Outline, &Plane), variance: Option<[f64; 2]>) -> f64 {
+    let frame = Frame::new(axis);
+    let k = outline.plane - s.low[frame.of[2]];
+    let nearest = |at: &[f64], low: usize, n: usize, x: f64| {
+        let after = at.partition_point(|v| *v < x).clamp(1, at.len() - 1);
+        let i = if x - at[after - 1] < at[after] - x { after - 1 } else { after };
+        i.clamp(low, low + n - 1) - low
+    };
+    let [w, h, _] = frame.size(s);
+    let square = |p: &[f64; 2]| {
+        let i = nearest(&plane.u_mm, s.low[frame.of[0]], w, p[0]);
+        let j = nearest(&plane.v_mm, s.low[frame.of[1]], h, p[1]);
+        let at = frame.index(s, i, j, k);
+        (0.5 * f64::from(s.outside_error[at] / s.contrast[at].max(f32::MIN_POSITIVE))).powi(2)
+    };
+    let points = &outline.line.points;
+    let share = (points.iter().map(square).sum::<f64>() / points.len().max(1) as f64).sqrt();
+    let sigma = variance.map_or(0.0, |v| (0.5 * (v[0] + v[1])).sqrt());
+    share.min(LARGEST_SHARE) * std::f64::consts::TAU.sqrt() * sigma
+}
+
+/// Largest error of a level that is granted, in contrasts.
+const LARGEST_SHARE: f64 = 0.25;
+
 fn curve(outline: &Outline, fit: &Smoothed, lumen: usize, variance: Option<[f64; 2]>, stack: &Stack) -> Curve {
     let spline = match variance {
         Some(v) => corrected(&fit.spline, v),
@@ -173,6 +201,7 @@ fn curve(outline: &Outline, fit: &Smoothed, lumen: usize, variance: Option<[f64;
         raw: outline.line.points.clone(),
         level: outline.level,
         standard_error_mm: fit.standard_error,
+        level_error_mm: 0.0,
         border,
         hole: outline.hole,
     }

@@ -65,6 +65,9 @@ pub struct Curve {
     pub level: f64,
     /// Standard error of the curve's position along its normal, mm.
     pub standard_error_mm: f64,
+    /// Standard error of the position by the level that it was drawn at, mm: noise in the local value of the surroundings,
+    /// and tissue that is brighter or darker beside the wall than that. Neighbouring curves share it ([`Contours::LEVEL_MM`]).
+    pub level_error_mm: f64,
     /// Parameter intervals (start, end in arc length, mm, possibly wrapping) that follow the image border and not the
     /// wall: no wall constraint may be taken there.
     pub border: Vec<[f64; 2]>,
@@ -170,6 +173,12 @@ pub struct Contours {
     pub thickness_mm: Option<f64>,
     /// The blur by which the curves were corrected in their planes; `None`: they are as drawn.
     pub blur: Option<Blur>,
+}
+
+impl Contours {
+    /// Distance over which curves share the error of their level, mm: the width of the Gaussian in which the surroundings
+    /// are taken, times the root of two as for the difference of two of them.
+    pub const LEVEL_MM: f64 = 2.8;
 }
 
 impl Curve {

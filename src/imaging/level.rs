@@ -35,6 +35,12 @@ pub(crate) struct Fields {
     pub(crate) wide: Vec<f32>,
 }
 
+/// What counts as lumen and what as surroundings, by voxel.
+struct Weights {
+    core: Vec<f32>,
+    ring: Vec<f32>,
+}
+
 impl Fields {
     /// The half-way level of a voxel.
     pub(crate) fn level(&self, i: usize) -> f32 {
@@ -108,6 +114,38 @@ impl Patch {
         level: impl Fn(usize) -> f32 + Sync,
         ctx: &Ctx,
     ) -> Result<Fields, Error> {
+        let Weights { core, ring } = self.weights(mask, level, ctx)?;
+        let raw = |i: usize| self.raw[i];
+        let inside = self.spread(|i| core[i], raw, INSIDE_MM, ctx)?;
+        let outside = self.spread(|i| ring[i], raw, OUTSIDE_MM, ctx)?;
+        let wide = self.spread(|i| core[i], raw, WIDE_MM, ctx)?;
+        Ok(Fields { inside, outside, wide })
+    }
+
+    /// Standard error of the outside values, by voxel: the noise of a mean over few voxels, N, and the tissue's texture T, which the
+    /// mean cannot follow.
+    ///
+    /// Of two diagonal neighbours, which lie on fields of one colour of the lattice, the mean over the other colour's fields is
+    /// subtracted: their product has the expectation T + 2 N, since nothing of their own noise is in it (noise is independent
+    /// from pixel to pixel; in interpolated images it counts as texture). The two means differ by 4 N in variance.
+    pub(crate) fn outside_error(&self, mask: &[bool], fields: &Fields, ctx: &Ctx) -> Result<Vec<f32>, Error> {
+        let Weights { ring, .. } = self.weights(mask, |i| fields.level(i), ctx)?;
+        let black = |i: usize| (i % self.n[0] + i / self.n[0]).is_multiple_of(2);
+        let field = |i: usize, of: bool| if black(i) == of { ring[i] } else { 0.0 };
+        let raw = |i: usize| self.raw[i];
+        let halves = [
+            self.spread(|i| field(i, true), raw, OUTSIDE_MM, ctx)?,
+            self.spread(|i| field(i, false), raw, OUTSIDE_MM, ctx)?,
+        ];
+        let off = |i: usize| self.raw[i] - halves[usize::from(black(i))][i];
+        let next = |i: usize| i + 1 + self.n[0];
+        let weight = |i: usize| ring.get(next(i)).map_or(0.0, |w| w.min(ring[i]));
+        let square = |i: usize| off(i) * off(next(i)) - 0.25 * (halves[0][i] - halves[1][i]).powi(2);
+        let variance = self.spread(weight, square, WIDE_MM, ctx)?;
+        Ok(variance.into_iter().map(|v| v.max(0.0).sqrt()).collect())
+    }
+
+    fn weights(&self, mask: &[bool], level: impl Fn(usize) -> f32 + Sync, ctx: &Ctx) -> Result<Weights, Error> {
         let filled = filled(mask, self.n, ctx)?;
         let other = (0..mask.len()).map(|i| !filled[i] && self.smooth[i] > level(i)).collect();
         let masks = [filled, mask.iter().map(|m| !m).collect(), other];
@@ -119,7 +157,7 @@ impl Patch {
         let d: Vec<&Vec<u8>> = found.iter().map(|f| &f.0).collect();
         let source = &found[0].1;
         let in_ring = |i: usize| (RING.0..=RING.1).contains(&d[0][i]) && d[2][i] == FAR;
-        let ground = self.spread(|i| f32::from(u8::from(in_ring(i))), WIDE_MM, ctx)?;
+        let ground = self.spread(|i| f32::from(u8::from(in_ring(i))), |i| self.raw[i], WIDE_MM, ctx)?;
         let runs_on = |i: usize| self.smooth[i] - ground[i] > RUNS_ON * (self.smooth[source[i] as usize] - ground[i]);
         let depth = |i: usize| match d[1][i] {
             0 => 0.0,
@@ -141,10 +179,7 @@ impl Patch {
             true => 1.0,
         };
         let core = |i: usize| if partial(i) { PARTIAL * depth(i) } else { depth(i) };
-        let inside = self.spread(core, INSIDE_MM, ctx)?;
-        let outside = self.spread(ring, OUTSIDE_MM, ctx)?;
-        let wide = self.spread(core, WIDE_MM, ctx)?;
-        Ok(Fields { inside, outside, wide })
+        Ok(Weights { core: (0..mask.len()).map(core).collect(), ring: (0..mask.len()).map(ring).collect() })
     }
     /// The voxels straight above and below one.
     fn neighbours(&self, i: usize) -> impl Iterator<Item = usize> {
@@ -152,8 +187,14 @@ impl Patch {
         let (below, above) = (i.checked_sub(area), Some(i + area).filter(|j| *j < self.raw.len()));
         below.into_iter().chain(above)
     }
-    /// Normalised convolution of the raw values with weights, over coarse cells of about 2/3 of the narrowest sigma.
-    fn spread(&self, weight: impl Fn(usize) -> f32 + Sync, sigma_mm: f64, ctx: &Ctx) -> Result<Vec<f32>, Error> {
+    /// Normalised convolution of values with weights, over coarse cells of about 2/3 of the narrowest sigma.
+    fn spread(
+        &self,
+        weight: impl Fn(usize) -> f32 + Sync,
+        value: impl Fn(usize) -> f32 + Sync,
+        sigma_mm: f64,
+        ctx: &Ctx,
+    ) -> Result<Vec<f32>, Error> {
         let per: [usize; 3] = std::array::from_fn(|a| ((0.67 * sigma_mm / self.step[a]).round() as usize).max(1));
         let m: [usize; 3] = std::array::from_fn(|a| self.n[a].div_ceil(per[a]));
         let area = m[0] * m[1];
@@ -166,7 +207,7 @@ impl Patch {
                         let w = weight(i);
                         if w > 0.0 {
                             let s = &mut sums[x / per[0] + m[0] * (y / per[1])];
-                            s[0] += w * self.raw[i];
+                            s[0] += w * value(i);
                             s[1] += w;
                         }
                     }

@@ -82,6 +82,7 @@ pub(crate) fn segmentation(stack: &Stack, mask: &Mask, settings: &Settings, ctx:
     let first = patch.fields(&inside, |_| f32::MAX, ctx)?;
     ctx.progress(0.6);
     let fields = patch.fields(&inside, |i| first.level(i), ctx)?;
+    let outside_error = patch.outside_error(&inside, &fields, ctx)?;
     let contrast: Vec<f32> = (0..inside.len()).map(|i| fields.contrast(i)).collect();
     let level: Vec<f32> = match settings.threshold {
         Some(t) => vec![t as f32; inside.len()],
@@ -99,6 +100,7 @@ pub(crate) fn segmentation(stack: &Stack, mask: &Mask, settings: &Settings, ctx:
         site: sites.site,
         level: sites.level,
         contrast,
+        outside_error,
         noise,
         threshold: if threshold.is_finite() { threshold } else { 0.0 },
         candidates: Vec::new(),

@@ -35,6 +35,8 @@ pub struct Segmentation {
     pub level: Vec<f32>,
     /// Lumen minus surroundings at each voxel.
     pub contrast: Vec<f32>,
+    /// Standard error of the local value of the surroundings, grey values: noise, and texture that it does not follow.
+    pub outside_error: Vec<f32>,
     /// Noise of the raw grey values, standard deviation.
     pub noise: f64,
     /// The level: the plan's, or the median local level over the lumen.
@@ -247,7 +249,8 @@ fn outlined(
             if grown.len() as f64 > LEAK * started as f64 {
                 warnings.push(leak(started, grown.len()));
             }
-            return Ok(finished(&patch, settings, &mask, &fields, (raw_noise, warnings)));
+            let outside_error = patch.outside_error(&mask, &fields, ctx)?;
+            return Ok(finished(&patch, settings, &mask, (&fields, outside_error), (raw_noise, warnings)));
         }
         seed = grown;
     }
@@ -362,7 +365,7 @@ fn finished(
     patch: &Patch,
     settings: &Settings,
     mask: &[bool],
-    fields: &Fields,
+    (fields, outside_error): (&Fields, Vec<f32>),
     (noise, warnings): (f64, Vec<Warning>),
 ) -> Segmentation {
     let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
@@ -397,6 +400,7 @@ fn finished(
         site,
         level,
         contrast,
+        outside_error,
         noise,
         threshold,
         candidates: Vec::new(),

@@ -21,6 +21,8 @@ pub struct Constraints {
     pub values: Vec<f64>,
     /// Standard error of the wanted value, mm.
     pub sigma_mm: Vec<f64>,
+    /// For each wall constraint the error of its contour's level, mm, which neighbours within [`Contours::LEVEL_MM`] share.
+    pub level_mm: Vec<f64>,
     /// The first `wall` constraints lie on the wall (value 0).
     pub wall: usize,
     /// For each interior constraint (they follow the wall) the wall point it belongs to and its distance, mm.
@@ -51,6 +53,7 @@ struct WallPoint {
     inward: V3,
     width_mm: f64,
     sigma_mm: f64,
+    level_mm: f64,
     curve: usize,
     planar_shift: Option<V3>,
 }
@@ -63,6 +66,7 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.points.push(w.position);
         c.values.push(0.0);
         c.sigma_mm.push(w.sigma_mm);
+        c.level_mm.push(w.level_mm);
         c.curve.push(Some(w.curve));
         c.planar_shift.push(w.planar_shift);
     }
@@ -92,6 +96,7 @@ pub(crate) fn spatial(
         points: wall,
         values: first.values[..first.wall].to_vec(),
         sigma_mm: first.sigma_mm[..first.wall].to_vec(),
+        level_mm: first.level_mm.clone(),
         wall: first.wall,
         interior: Vec::new(),
         curve: first.curve.clone(),
@@ -202,6 +207,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
             inward: p.inward,
             width_mm: width(plane, &polygons, p.position, p.inward).unwrap_or(2.0 * radius),
             sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
+            level_mm: curve.level_error_mm,
             curve: number,
             planar_shift: contours.blur.filter(|_| !at_end).map(|b| p.inward * -b.planar_shift_mm(plane, &p)),
         });
@@ -260,6 +266,7 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
         c.points.push(tip.position);
         c.values.push(0.0);
         c.sigma_mm.push(0.5 * contours.pixel_mm);
+        c.level_mm.push(0.0);
         c.curve.push(None);
         c.planar_shift.push(None);
         c.wall += 1;

@@ -10,7 +10,8 @@
 //! g is a sum of plane waves. |h|^3 has the spectral density 96 pi / k^6 in three dimensions; wave numbers are drawn
 //! log-uniformly from the size of the data to half the spacing of the wall points, each wave weighted by the density.
 //! The errors of a contour are those of its smoothing spline: not independent from point to point but a trigonometric
-//! polynomial along the contour with as many terms as the spline has degrees of freedom ([`CONTOUR_MODES`]).
+//! polynomial along the contour with as many terms as the spline has degrees of freedom ([`CONTOUR_MODES`]). The error of the
+//! level at which contours are drawn is a field of its own, which neighbouring contours share.
 
 use crate::Error;
 use crate::constraints::Constraints;
@@ -18,6 +19,7 @@ use crate::interpolate::Solver;
 use crate::kernel::Centres;
 use crate::system::Scale;
 use exec::Ctx;
+use imaging::Contours;
 use space::P3;
 
 /// Terms of a contour's error: mean, two of position, two of ellipticity, two more. Smoothing splines of discs of 5 to 10
@@ -25,6 +27,8 @@ use space::P3;
 const CONTOUR_MODES: usize = 7;
 /// Plane waves of a draw: some 25 per factor of two in wave number.
 const WAVES: usize = 256;
+/// Plane waves of a draw of the levels' errors.
+const LEVEL_WAVES: usize = 128;
 /// Smallest wave number, in scaled coordinates (the farthest constraint at distance 1): what is longer is as good as a
 /// polynomial of second degree, which the constraints determine.
 const WAVE_NUMBER_MIN: f64 = 0.5;
@@ -81,6 +85,14 @@ impl Ensemble {
             let mut normal = Normal::new(number as u64);
             let waves = waves(s, longest.max(2.0 * WAVE_NUMBER_MIN), &mut normal);
             let mut values = errors(c, &mut normal);
+            let level = level_waves(&scale, &mut normal);
+            for (v, (level_mm, p)) in values.iter_mut().zip(c.level_mm.iter().zip(&points)) {
+                *v += level_mm * sum(&level, *p);
+            }
+            // an interior point was set off from its wall point and shares its error
+            for (k, (wall, _)) in c.interior.iter().enumerate() {
+                values[c.wall + k] += values[*wall];
+            }
             for (v, p) in values.iter_mut().zip(&points) {
                 *v += sum(&waves, *p);
             }
@@ -149,6 +161,19 @@ fn waves(s: f64, longest: f64, normal: &mut Normal) -> Vec<Wave> {
             // a wave of random phase and normal amplitude with variance v has amplitude sqrt(2 v) times a normal number
             let amplitude = (2.0 * variance).sqrt() * normal.next();
             Wave { k: d.map(|x| x * k / length), phase: std::f64::consts::TAU * normal.uniform(), amplitude }
+        })
+        .collect()
+}
+
+/// Waves of a field of variance 1 and covariance exp(-h^2 / (2 l^2)), l the distance over which levels err together: wave
+/// vectors are normal with deviation 1 / l.
+fn level_waves(scale: &Scale, normal: &mut Normal) -> Vec<Wave> {
+    let per_scaled = scale.length / Contours::LEVEL_MM;
+    let amplitude = (2.0 / LEVEL_WAVES as f64).sqrt();
+    (0..LEVEL_WAVES)
+        .map(|_| {
+            let k = std::array::from_fn(|_| per_scaled * normal.next());
+            Wave { k, phase: std::f64::consts::TAU * normal.uniform(), amplitude }
         })
         .collect()
 }
@@ -264,6 +289,7 @@ mod tests {
             wall: n / 2,
             interior: Vec::new(),
             planar_shift: vec![None; n / 2],
+            level_mm: vec![0.0; n / 2],
             curve: (0..n / 2).map(|i| Some(i / per_ring)).collect(),
         };
         let ctx = Ctx::new(2).unwrap();
@@ -297,6 +323,7 @@ mod tests {
             wall: n,
             interior: Vec::new(),
             planar_shift: vec![None; n],
+            level_mm: vec![0.0; n],
             curve: vec![Some(0); n],
         };
         let draws = 3000;

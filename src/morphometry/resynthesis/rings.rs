@@ -333,6 +333,7 @@ fn push_ring(ring: &Ring, keep: &[bool], out: &mut Contours) {
         raw,
         level: 0.0,
         standard_error_mm: ERROR_PX * out.pixel_mm,
+        level_error_mm: 0.0,
         border,
         hole: false,
     });
