@@ -260,9 +260,9 @@ pub(crate) struct Vary {
     /// BRANCH: pressed into its junction's plane.
     #[arg(long, value_name = "BRANCH")]
     pub(crate) planar: Vec<String>,
-    /// plan.json; its `variant`, if any, is one more variant.
+    /// plan.json; its `variant`, if any, goes before the options. Given several times it makes several series.
     #[arg(long)]
-    pub(crate) plan: Option<PathBuf>,
+    pub(crate) plan: Vec<PathBuf>,
     /// Threads (default: all cores; the bytes do not depend on it).
     #[arg(long)]
     pub(crate) threads: Option<usize>,
@@ -285,6 +285,15 @@ pub(crate) struct Cohort {
     /// Only this quantity (deg, diameter_mm, area_mm2, ...); may be given several times.
     #[arg(long)]
     pub(crate) quantity: Vec<String>,
+    /// Only angles or only branches.
+    #[arg(long, value_parser = ["angle", "branch"])]
+    pub(crate) kind: Vec<String>,
+    /// Only the branch with this number; may be given several times.
+    #[arg(long)]
+    pub(crate) branch: Vec<u64>,
+    /// Only reconstructions of scans, or only variants.
+    #[arg(long, value_parser = ["reconstruction", "variant"])]
+    pub(crate) job_kind: Option<String>,
     /// Leave out results with warnings.
     #[arg(long)]
     pub(crate) without_warnings: bool,

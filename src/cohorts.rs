@@ -2,8 +2,11 @@
 
 use crate::arguments::Cohort;
 use crate::jobs::report;
-use artefact::cohort::{Filter, Row, csv, document, plot, rows, spreads};
+use artefact::cohort::{Filter, Row, Table, csv, document, plot, spreads};
 use pipeline::Failure;
+use serde_json::Value;
+use service::Problem;
+use service::cohort::{Source, Wanted};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -25,19 +28,32 @@ pub(crate) fn cohort(a: &Cohort) -> ExitCode {
 }
 
 fn made(a: &Cohort) -> Result<String, Failure> {
-    let filter = Filter { names: a.name.clone(), quantities: a.quantity.clone(), without_warnings: a.without_warnings };
-    let mut all = Vec::new();
+    let filter = Filter {
+        names: a.name.clone(),
+        quantities: a.quantity.clone(),
+        kinds: a.kind.clone(),
+        branches: a.branch.clone(),
+        without_warnings: a.without_warnings,
+    };
+    let mut all = Table::default();
     for folder in &a.input {
         let file = if folder.is_dir() { folder.join("result.json") } else { folder.clone() };
         let bytes = std::fs::read(&file).map_err(|e| Failure::unreadable(&file, &e))?;
-        let result = serde_json::from_slice(&bytes)
+        let result: Value = serde_json::from_slice(&bytes)
             .map_err(|e| Failure::unreadable(&file, &std::io::Error::new(std::io::ErrorKind::InvalidData, e)))?;
-        all.extend(rows(&name(folder), &result, &filter));
+        let kind = if result["variant"].is_null() { "reconstruction" } else { "variant" };
+        if a.job_kind.as_ref().is_none_or(|wanted| wanted == kind) {
+            all.add(&name(folder), None, &result, &filter);
+        }
     }
     if let Some(out) = &a.out {
         written(out, &all).map_err(|e| Failure::internal(format!("{} cannot be written: {e}", out.display())))?;
     }
-    Ok(if a.json { format!("{}\n", document(&all)) } else { table(&all) })
+    if a.json {
+        let text = serde_json::to_string(&document(&all)).map_err(Failure::internal)?;
+        return Ok(format!("{text}\n"));
+    }
+    Ok(table(&all.rows))
 }
 
 /// A job is called after its folder.
@@ -47,11 +63,40 @@ fn name(folder: &Path) -> String {
     full.file_name().map_or_else(|| folder.display().to_string(), |n| n.to_string_lossy().into_owned())
 }
 
-fn written(out: &Path, all: &[Row]) -> std::io::Result<()> {
+fn written(out: &Path, all: &Table) -> std::io::Result<()> {
     std::fs::create_dir_all(out)?;
-    std::fs::write(out.join(CSV), csv(all))?;
-    std::fs::write(out.join(JSON), format!("{:#}\n", document(all)))?;
-    std::fs::write(out.join(SVG), plot(all))
+    std::fs::write(out.join(CSV), csv(&all.rows))?;
+    std::fs::write(out.join(JSON), serde_json::to_string_pretty(&document(all))? + "\n")?;
+    std::fs::write(out.join(SVG), plot(&all.rows))
+}
+
+/// The service's table of many jobs, made by the same code.
+pub(crate) struct OfJobs {
+    filter: Filter,
+    table: Table,
+}
+
+/// A table for `GET /v1/cohort`.
+pub(crate) fn of_jobs(wanted: Wanted) -> Box<dyn service::cohort::Table> {
+    let Wanted { names, quantities, kinds, branches, without_warnings } = wanted;
+    let filter = Filter { names, quantities, kinds, branches, without_warnings };
+    Box::new(OfJobs { filter, table: Table::default() })
+}
+
+impl service::cohort::Table for OfJobs {
+    fn add(&mut self, source: &Source, result: &[u8]) -> Result<(), Problem> {
+        let result: Value = serde_json::from_slice(result).map_err(Problem::internal)?;
+        self.table.add(&source.job, source.created_at.clone(), &result, &self.filter);
+        Ok(())
+    }
+
+    fn json(&self) -> Result<Vec<u8>, Problem> {
+        serde_json::to_vec(&document(&self.table)).map_err(Problem::internal)
+    }
+
+    fn csv(&self) -> Result<Vec<u8>, Problem> {
+        Ok(csv(&self.table.rows).into_bytes())
+    }
 }
 
 /// Medians and quartiles in 80 columns.
@@ -63,4 +108,17 @@ fn table(all: &[Row]) -> String {
         let _ = writeln!(out, "{:<24}{:<23}{:>5}{median:>9.3}{quartiles:>19}", s.name, s.quantity, s.count);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use artefact::cohort::{DEGREES, QUANTITIES};
+    use service::cohort::Quantity;
+
+    #[test]
+    fn the_api_names_every_quantity() {
+        let ours: Vec<&str> = QUANTITIES.iter().map(|(name, _)| *name).chain([DEGREES]).collect();
+        let named: Vec<&str> = Quantity::ALL.iter().map(|q| q.as_str()).collect();
+        assert_eq!(named, ours);
+    }
 }

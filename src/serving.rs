@@ -136,6 +136,7 @@ fn data_config(a: Data) -> Config {
         receive,
         check_plan,
         check_scan,
+        cohort: crate::cohorts::of_jobs,
         ..Config::default()
     }
 }

@@ -8,6 +8,7 @@ use crate::jobs::{Shown, context, plan_of, report, summary};
 use artefact::plan::{Branch, Plan, ROLES, Variant, VariantChange};
 use pipeline::Failure;
 use serde_json::json;
+use std::path::Path;
 use std::process::ExitCode;
 
 /// Most variants of one call.
@@ -22,10 +23,8 @@ pub(crate) fn vary(a: &Vary) -> ExitCode {
 }
 
 fn made(a: &Vary) -> Result<(), Failure> {
-    let plan = plan_of(a.plan.as_deref())?;
     let ctx = context(a.threads)?;
-    for (name, variant) in series(a, plan.variant.as_ref())? {
-        let plan = Plan { variant: Some(variant), ..plan.clone() };
+    for (name, plan) in planned(a)? {
         let out = a.out.join(&name);
         let shown = Shown::new();
         let outcome = pipeline::run(std::slice::from_ref(&a.source), &plan, &out, &ctx, &|e| shown.show(e));
@@ -36,6 +35,42 @@ fn made(a: &Vary) -> Result<(), Failure> {
     }
     Ok(())
 }
+
+/// All variants with their names. Every plan is read before the first variant is made; several plans give each of their
+/// variants the name of the plan's file.
+fn planned(a: &Vary) -> Result<Vec<(String, Plan)>, Failure> {
+    let mut plans: Vec<Option<&Path>> = a.plan.iter().map(|file| Some(file.as_path())).collect();
+    if plans.is_empty() {
+        plans.push(None);
+    }
+    let mut all: Vec<(String, Plan)> = Vec::new();
+    for file in &plans {
+        let plan = plan_of(*file)?;
+        let stem = file.and_then(Path::file_stem).map(|stem| stem.to_string_lossy().into_owned());
+        for (name, variant) in series(a, plan.variant.as_ref())? {
+            let name = match &stem {
+                Some(stem) if plans.len() > 1 && name == UNCHANGED => stem.clone(),
+                Some(stem) if plans.len() > 1 => format!("{stem}_{name}"),
+                _ => name,
+            };
+            if all.iter().any(|(other, _)| *other == name) {
+                return Err(refused(&format!(
+                    "two variants would be named {name}; give the plans different file names"
+                )));
+            }
+            all.push((name, Plan { variant: Some(variant), ..plan.clone() }));
+        }
+    }
+    if all.len() > MOST {
+        return Err(refused(&format!(
+            "these plans and options make more than {MOST} variants; make them in several calls"
+        )));
+    }
+    Ok(all)
+}
+
+/// The name of a variant that no option changes.
+const UNCHANGED: &str = "unchanged";
 
 /// The variants with their names: the product of all options.
 fn series(a: &Vary, planned: Option<&Variant>) -> Result<Vec<(String, Variant)>, Failure> {
@@ -60,7 +95,7 @@ fn series(a: &Vary, planned: Option<&Variant>) -> Result<Vec<(String, Variant)>,
         }
     }
     let named = |(names, variant): (Vec<String>, Variant)| {
-        (if names.is_empty() { "unchanged".to_owned() } else { names.join("_").replace(':', "-") }, variant)
+        (if names.is_empty() { UNCHANGED.to_owned() } else { names.join("_").replace(':', "-") }, variant)
     };
     Ok(series.into_iter().map(named).collect())
 }

@@ -3,13 +3,17 @@
 //! A cohort is made from result.json files alone, so that jobs of different versions and machines can be compared. A value
 //! that a result has as null stays out of the sums and is counted; it never becomes a zero.
 
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::Value;
 
 /// `schema` of the cohort's JSON.
 pub const COHORT_SCHEMA: &str = "vasculum/cohort/1";
 
+/// The quantity of an angle.
+pub const DEGREES: &str = "deg";
+
 /// Numbers of a branch that are compared: name, and where result.json has them.
-const QUANTITIES: [(&str, &str); 8] = [
+pub const QUANTITIES: [(&str, &str); 8] = [
     ("diameter_mm", "/diameter_mm"),
     ("length_mm", "/length_mm"),
     ("tortuosity", "/tortuosity"),
@@ -21,7 +25,7 @@ const QUANTITIES: [(&str, &str); 8] = [
 ];
 
 /// One number of one job.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
     /// The job.
     pub job: String,
@@ -48,8 +52,81 @@ pub struct Filter {
     pub names: Vec<String>,
     /// Quantities; angles have `deg`.
     pub quantities: Vec<String>,
+    /// `angle` or `branch`.
+    pub kinds: Vec<String>,
+    /// Numbers of branches; angles belong to no single branch and are left out.
+    pub branches: Vec<u64>,
     /// Leave out results with warnings.
     pub without_warnings: bool,
+}
+
+/// What a table tells of a result as a whole.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Facts {
+    /// The job.
+    pub job: String,
+    /// RFC 3339, where it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub created_at: Option<String>,
+    /// Whether the vessel was made from a measured one.
+    pub variant: bool,
+    /// Slices of its scan.
+    pub slices: Option<u64>,
+    /// Distance between slices, mm.
+    pub slice_spacing_mm: Option<f64>,
+    /// Lumen within the data's ends, mm^3.
+    pub volume_mm3: Option<f64>,
+    /// Node of the junction that the report puts first; `null` without one.
+    pub main_junction: Option<u64>,
+    /// Warnings of the result.
+    pub warnings: usize,
+}
+
+/// Many results, filled one by one: only their numbers are held.
+#[derive(Clone, Debug, Default)]
+pub struct Table {
+    /// One number of one job each, in the order in which the results came.
+    pub rows: Vec<Row>,
+    /// The results from which some row came.
+    pub results: Vec<Facts>,
+}
+
+impl Table {
+    /// Takes what `filter` wants of one result.
+    pub fn add(&mut self, job: &str, created_at: Option<String>, result: &Value, filter: &Filter) {
+        let rows = rows(job, result, filter);
+        if !rows.is_empty() {
+            self.results.push(facts(job, created_at, result));
+            self.rows.extend(rows);
+        }
+    }
+}
+
+fn facts(job: &str, created_at: Option<String>, result: &Value) -> Facts {
+    let width = |j: &Value| {
+        let of = |id: &Value| list(&result["branches"]).iter().find(|b| b["id"] == *id)?["diameter_mm"].as_f64();
+        list(&j["branches"]).iter().map(|id| of(id).unwrap_or(0.0)).fold(f64::INFINITY, f64::min)
+    };
+    let measured = |j: &Value| list(&j["angles"]).iter().any(|a| !a["value"].is_null());
+    let node = |j: &Value| j["node"].as_u64().unwrap_or(u64::MAX);
+    // measured before others, then the one whose thinnest branch is widest, then the first
+    let order = |a: &&Value, b: &&Value| {
+        measured(a).cmp(&measured(b)).then(width(a).total_cmp(&width(b))).then(node(b).cmp(&node(a)))
+    };
+    Facts {
+        job: job.to_owned(),
+        created_at,
+        variant: !result["variant"].is_null(),
+        slices: result["input"]["slices"].as_u64(),
+        slice_spacing_mm: result["input"]["spacing_mm"][2].as_f64(),
+        volume_mm3: result["surface"]["volume_mm3"].as_f64(),
+        main_junction: list(&result["junctions"]).iter().max_by(order).and_then(|j| j["node"].as_u64()),
+        warnings: list(&result["warnings"]).len(),
+    }
+}
+
+fn list(value: &Value) -> &[Value] {
+    value.as_array().map_or(&[], Vec::as_slice)
 }
 
 /// How the values of one name and quantity spread.
@@ -73,7 +150,7 @@ pub struct Spread {
 
 /// Rows of one result, in its own order.
 pub fn rows(job: &str, result: &Value, filter: &Filter) -> Vec<Row> {
-    let warnings = result["warnings"].as_array().map_or(0, Vec::len);
+    let warnings = list(&result["warnings"]).len();
     if filter.without_warnings && warnings > 0 {
         return Vec::new();
     }
@@ -87,17 +164,16 @@ pub fn rows(job: &str, result: &Value, filter: &Filter) -> Vec<Row> {
         band95: band[0].as_f64().zip(band[1].as_f64()).map(|(a, b)| [a, b]),
         warnings,
     };
-    let list = |v: &'_ Value| v.as_array().cloned().unwrap_or_default();
     let mut out = Vec::new();
     for junction in list(&result["junctions"]) {
         for a in list(&junction["angles"]) {
-            out.push(row("angle", &junction["node"], &a["name"], "deg", a["value"].as_f64(), &a["band95"]));
+            out.push(row("angle", &junction["node"], &a["name"], DEGREES, a["value"].as_f64(), &a["band95"]));
         }
     }
     for b in list(&result["branches"]) {
         for (quantity, at) in QUANTITIES {
             let (value, band) = match quantity {
-                "area_mm2" => (median_area(&b), &Value::Null),
+                "area_mm2" => (median_area(b), &Value::Null),
                 "diameter_mm" => (b["diameter_mm"].as_f64(), &b["diameter_band95"]),
                 "helix_torsion_per_mm" => (b.pointer(at).and_then(Value::as_f64), &b["helix"]["torsion_band95"]),
                 "helix_curvature_per_mm" => (b.pointer(at).and_then(Value::as_f64), &b["helix"]["curvature_band95"]),
@@ -107,7 +183,13 @@ pub fn rows(job: &str, result: &Value, filter: &Filter) -> Vec<Row> {
         }
     }
     let wanted = |list: &[String], name: &str| list.is_empty() || list.iter().any(|w| w == name);
-    out.retain(|r| wanted(&filter.names, &r.name) && wanted(&filter.quantities, r.quantity));
+    let branch = |r: &Row| filter.branches.is_empty() || (r.kind == "branch" && filter.branches.contains(&r.id));
+    out.retain(|r| {
+        wanted(&filter.names, &r.name)
+            && wanted(&filter.quantities, r.quantity)
+            && wanted(&filter.kinds, r.kind)
+            && branch(r)
+    });
     out
 }
 
@@ -161,21 +243,45 @@ fn quantile(sorted: &[f64], p: f64) -> f64 {
     sorted[i] + t * (sorted[(i + 1).min(sorted.len() - 1)] - sorted[i])
 }
 
-/// Rows and spreads as JSON.
-pub fn document(rows: &[Row]) -> Value {
-    let mut jobs: Vec<&str> = rows.iter().map(|r| r.job.as_str()).collect();
-    jobs.dedup();
-    let row = |r: &Row| {
-        json!({"job": r.job, "kind": r.kind, "id": r.id, "name": r.name, "quantity": r.quantity, "value": r.value,
-               "band95": r.band95, "warnings": r.warnings})
-    };
-    let spread = |s: &Spread| {
+/// The JSON form of a table.
+#[derive(Debug, Serialize)]
+pub struct Document<'a> {
+    schema: &'static str,
+    jobs: usize,
+    results: &'a [Facts],
+    rows: &'a [Row],
+    summary: Vec<Summary>,
+}
+
+/// The JSON form of a spread.
+#[derive(Debug, Serialize)]
+struct Summary {
+    name: String,
+    quantity: &'static str,
+    count: usize,
+    missing: usize,
+    min: f64,
+    q1: f64,
+    median: f64,
+    q3: f64,
+    max: f64,
+    mean: f64,
+    standard_deviation: Option<f64>,
+}
+
+impl From<Spread> for Summary {
+    fn from(s: Spread) -> Self {
         let [min, q1, median, q3, max] = s.quantiles;
-        json!({"name": s.name, "quantity": s.quantity, "count": s.count, "missing": s.missing, "min": min, "q1": q1,
-               "median": median, "q3": q3, "max": max, "mean": s.mean, "standard_deviation": s.deviation})
-    };
-    json!({"schema": COHORT_SCHEMA, "jobs": jobs.len(), "rows": rows.iter().map(row).collect::<Vec<_>>(),
-           "summary": spreads(rows).iter().map(spread).collect::<Vec<_>>()})
+        let (mean, standard_deviation) = (s.mean, s.deviation);
+        let Spread { name, quantity, count, missing, .. } = s;
+        Self { name, quantity, count, missing, min, q1, median, q3, max, mean, standard_deviation }
+    }
+}
+
+/// Results, rows and spreads, to be written as JSON.
+pub fn document(table: &Table) -> Document<'_> {
+    let summary = spreads(&table.rows).into_iter().map(Summary::from).collect();
+    Document { schema: COHORT_SCHEMA, jobs: table.results.len(), results: &table.results, rows: &table.rows, summary }
 }
 
 /// Rows as CSV; an empty cell is a value that could not be had.
@@ -262,6 +368,7 @@ fn escaped(text: &str) -> String {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use serde_json::json;
 
     fn result(graft: f64, angle: Option<f64>, warned: bool) -> Value {
         let warnings = if warned { json!([{"code": "a.b", "message": "", "where": null}]) } else { json!([]) };
@@ -272,13 +379,19 @@ mod tests {
                              "open": [false, false, false, true, false]}, "helix": null, "stenosis": {"area_ratio": 0.9}}]})
     }
 
-    fn cohort(filter: &Filter) -> Vec<Row> {
+    fn table(filter: &Filter) -> Table {
         let jobs = [
             ("a", result(4.0, Some(40.0), false)),
             ("b", result(6.0, None, true)),
             ("c", result(5.0, Some(50.0), false)),
         ];
-        jobs.iter().flat_map(|(job, r)| rows(job, r, filter)).collect()
+        let mut table = Table::default();
+        jobs.iter().for_each(|(job, r)| table.add(job, None, r, filter));
+        table
+    }
+
+    fn cohort(filter: &Filter) -> Vec<Row> {
+        table(filter).rows
     }
 
     #[test]
@@ -297,8 +410,12 @@ mod tests {
 
     #[test]
     fn filters_keep_what_was_asked_for() {
-        let only =
-            Filter { names: vec!["graft".into()], quantities: vec!["diameter_mm".into()], without_warnings: true };
+        let only = Filter {
+            names: vec!["graft".into()],
+            quantities: vec!["diameter_mm".into()],
+            without_warnings: true,
+            ..Filter::default()
+        };
         let rows = cohort(&only);
         assert_eq!(
             rows.iter().map(|r| (r.job.as_str(), r.value)).collect::<Vec<_>>(),
@@ -307,14 +424,33 @@ mod tests {
     }
 
     #[test]
+    fn kinds_and_branches_are_filters_too() {
+        let kinds = |kind: &str| cohort(&Filter { kinds: vec![kind.into()], ..Filter::default() });
+        assert!(kinds("angle").iter().all(|r| r.quantity == DEGREES) && kinds("angle").len() == 3);
+        assert_eq!(kinds("branch").len(), 3 * QUANTITIES.len());
+        let branch = |id| cohort(&Filter { branches: vec![id], ..Filter::default() });
+        assert_eq!((branch(0).len(), branch(1).len()), (3 * QUANTITIES.len(), 0), "an angle's node 1 is no branch");
+    }
+
+    #[test]
+    fn the_main_junction_is_measured_and_wide() {
+        let junction = |node: u64, branches: [u64; 2], value: Option<f64>| json!({"node": node, "branches": branches, "angles": [{"name": "graft_proximal", "value": value}]});
+        let branch = |id: u64, wide: f64| json!({"id": id, "role": "other", "diameter_mm": wide});
+        let result = json!({
+            "branches": [branch(0, 9.0), branch(1, 3.0), branch(2, 5.0)], "warnings": [],
+            "junctions": [junction(4, [0, 0], None), junction(5, [0, 1], Some(1.0)), junction(7, [0, 2], Some(1.0)), junction(6, [0, 2], Some(1.0))]});
+        assert_eq!(facts("a", None, &result).main_junction, Some(6));
+    }
+
+    #[test]
     fn the_table_the_document_and_the_plot_agree() {
-        let rows = cohort(&Filter::default());
-        let table = csv(&rows);
-        assert_eq!(table.lines().count(), rows.len() + 1);
-        assert!(table.contains("b,angle,1,graft_proximal,deg,,1,2,1"), "{table}");
-        let document = document(&rows);
+        let table = table(&Filter::default());
+        let (rows, text) = (&table.rows, csv(&table.rows));
+        assert_eq!(text.lines().count(), rows.len() + 1);
+        assert!(text.contains("b,angle,1,graft_proximal,deg,,1,2,1"), "{text}");
+        let document = serde_json::to_value(document(&table)).unwrap();
         assert_eq!((document["jobs"].as_u64(), document["rows"].as_array().unwrap().len()), (Some(3), rows.len()));
-        let dots = plot(&rows).matches("<circle").count();
+        let dots = plot(rows).matches("<circle").count();
         assert_eq!(dots, rows.iter().filter(|r| r.value.is_some()).count());
     }
 }

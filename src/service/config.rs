@@ -1,6 +1,7 @@
 //! What an operator may set. The binary parses the command line and the environment into [`Config`]; nothing below
 //! reads either.
 
+use crate::cohort::{self, NewTable};
 use crate::error::Problem;
 use crate::tls::Tls;
 use std::net::SocketAddr;
@@ -136,6 +137,9 @@ pub struct Config {
     pub check_plan: CheckPlan,
     /// Reads a scan for `?validate=true`. Default: null; the binary wires the pipeline's reader.
     pub check_scan: CheckScan,
+    /// Makes the table of many results for `GET /v1/cohort`. Default: it only counts; the binary wires the artefact
+    /// crate's.
+    pub cohort: NewTable,
 }
 
 impl Default for Config {
@@ -168,6 +172,7 @@ impl Default for Config {
             stow_quiet_seconds: 30,
             check_plan: crate::intake::json_object,
             check_scan: |_, _| Ok(serde_json::Value::Null),
+            cohort: cohort::count,
         }
     }
 }

@@ -8,6 +8,7 @@
 
 pub mod audit;
 pub mod auth;
+pub mod cohort;
 pub mod config;
 pub mod db;
 pub mod error;

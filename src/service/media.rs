@@ -110,15 +110,15 @@ pub fn media_type(name: &str) -> &'static str {
     }
 }
 
-/// The form that an Accept header prefers: highest q, then the more exact range, then our own order.
+/// The form of these that an Accept header prefers: highest q, then the more exact range, then our own order.
 /// No header, or an empty one, takes JSON; `None` when nothing offered is acceptable.
-pub fn negotiate(accept: &str) -> Option<&'static Form> {
+pub fn negotiate<'a>(accept: &str, forms: &'a [Form]) -> Option<&'a Form> {
     if accept.trim().is_empty() {
-        return FORMS.first();
+        return forms.first();
     }
     let ranges: Vec<(String, f32)> = accept.split(',').filter_map(range).collect();
     let mut best: Option<(&Form, f32, u8)> = None;
-    for form in FORMS {
+    for form in forms {
         let Some((exact, q)) = quality(form, &ranges) else { continue };
         if q > 0.0 && best.is_none_or(|(_, bq, be)| (q, exact) > (bq, be)) {
             best = Some((form, q, exact));
@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn accept_is_read_as_rfc_9110_says() {
-        let artefact = |accept| negotiate(accept).map(|f| f.artefact);
+        let artefact = |accept| negotiate(accept, FORMS).map(|f| f.artefact);
         assert_eq!(artefact(""), Some("result.json"));
         assert_eq!(artefact("*/*"), Some("result.json"));
         assert_eq!(artefact("model/gltf-binary"), Some("surface.glb"));

@@ -255,6 +255,33 @@ async function correctRoles(id, truth) {
   return next;
 }
 
+// Asks for a variant, waits for it in the list and opens it beside its parent.
+async function vary(id) {
+  await open(`#/jobs/${id}`, ".scene canvas");
+  await page.getByText("Make variants", { exact: true }).click();
+  await page.getByLabel("Degrees").fill("60, sixty");
+  await page.getByRole("button", { name: "Make them" }).click();
+  await page.getByText("Give one or more numbers").waitFor();
+  await page.getByLabel("Change", { exact: true }).selectOption("curvature");
+  await page.getByLabel("Torsion, 1/mm").waitFor();
+  await page.getByLabel("Change", { exact: true }).selectOption("angle");
+  await page.getByLabel("Degrees").fill("60");
+  await page.getByRole("button", { name: "Make them" }).click();
+  const line = page.locator(".vary tr", { has: page.getByRole("link", { name: "graft at 60.0° to proximal", exact: true }) });
+  const beside = line.getByRole("link", { name: /Compare with this result/ });
+  await beside.waitFor({ timeout: LONG });
+  await accessible("a result with a variant");
+  await page.locator(".vary").scrollIntoViewIfNeeded();
+  await page.screenshot({ path: join(work, "portal-vary.png") });
+  await beside.click();
+  await page.locator(".compare-top table").first().waitFor({ timeout: LONG });
+  const cells = await page.locator("tr", { has: page.getByText("Graft – proximal", { exact: true }) }).locator("td").allInnerTexts();
+  assert.ok(Math.abs(Number(cells[2].replace("°", "")) - 60) <= 0.3, `the variant is beside its parent: ${cells}`);
+  await page.locator(".scene canvas").waitFor({ timeout: LONG });
+  await page.waitForTimeout(1500);
+  await shot("vary-compare");
+}
+
 async function compare(a, b, truth) {
   await open(`#/compare?a=${a}&b=${b}`, ".compare-top table");
   const other = await read(`/v1/jobs/${b}/result`);
@@ -304,7 +331,7 @@ async function queue() {
   await line.getByRole("button", { name: /^Cancel/ }).click();
   await line.getByText("cancelled").waitFor();
   await page.getByLabel("State").selectOption("succeeded");
-  await until("a filtered queue", async () => (await page.locator("#queue tr").count()) === 2);
+  await until("a filtered queue", async () => (await page.locator("#queue tr").count()) === 3);
   await page.getByLabel("State").selectOption("");
   await page.getByRole("button", { name: "Size" }).click();
   await page.locator('th[aria-sort="descending"]', { hasText: "Size" }).waitFor();
@@ -350,7 +377,14 @@ async function plainImages(truth) {
 
 async function cohort() {
   await open("#/cohort", ".cohort-plots .point");
-  await until("two results", async () => (await page.locator(".cohort-plots .point").count()) === 2);
+  const points = (n) => until(`${n} results`, async () => (await page.locator(".cohort-plots .point").count()) === n);
+  await points(3);
+  await page.getByLabel("What", { exact: true }).selectOption("reconstruction");
+  await points(2);
+  await page.getByLabel("Sent from").fill("2999-01-01");
+  await page.getByText("No finished job with numbers").waitFor();
+  await page.getByLabel("Sent from").fill("");
+  await points(2);
   const [file] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save as CSV" }).click()]);
   const lines = readFileSync(await file.path(), "utf8").trim().split("\r\n");
   assert.equal(lines.length, 3);
@@ -421,6 +455,7 @@ try {
   await coupled();
   const other = await correctRoles(id, truth);
   await compare(id, other, truth);
+  await vary(id);
   await download(id);
   await queue();
   await mendFailed();

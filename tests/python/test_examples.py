@@ -58,7 +58,8 @@ class Bench:
             if parameter["in"] == "path":
                 path = path.replace("{" + name + "}", str(value))
             else:
-                {"query": query, "header": headers}[parameter["in"]][name] = str(value)
+                text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+                {"query": query, "header": headers}[parameter["in"]][name] = text
         body = {}
         if media:
             example = operation["requestBody"]["content"][media]["example"]
@@ -144,6 +145,12 @@ def everything(bench):
     bench.send("retry_job", id=failing)
     for operation in ("list_artefacts", "read_artefact", "read_result"):
         bench.send(operation, id=whole)
+    table = bench.send("read_cohort").json()
+    assert table["jobs"] == 1 and table["rows"][0]["job"] == whole
+    series = bench.send("create_jobs", media="application/json", id=whole).json()["items"]
+    assert [job["parent"] for job in series] == [whole, whole]
+    for job in series:
+        bench.send("cancel_job", id=job["id"])
     bench.send("follow_job", id=whole, accept="application/json")
     stream = bench.send("follow_job", id=whole, accept="text/event-stream").text
     assert "event: state" in stream

@@ -86,6 +86,7 @@ fn job() -> NewJob {
         memory_mb: 0,
         trace_id: "0".to_owned(),
         idempotency_key: None,
+        parent: None,
     }
 }
 

@@ -99,7 +99,7 @@ async fn result(
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or("");
     let form = match &wanted.format {
         Some(word) => media::form_of(word),
-        None => media::negotiate(accept),
+        None => media::negotiate(accept, FORMS),
     };
     let form = form.ok_or_else(not_acceptable)?;
     if job.state != JobState::Succeeded {

@@ -134,14 +134,10 @@ async fn create(
     Query(taking): Query<Taking>,
     request: Request,
 ) -> Result<Response, Problem> {
-    let priority = taking.priority.unwrap_or(0);
-    if priority.abs() > LARGEST_PRIORITY {
-        let detail = format!("The priority must be {} to {LARGEST_PRIORITY}.", -LARGEST_PRIORITY);
-        return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
-    }
+    let priority = priority_of(taking.priority)?;
     let headers = request.headers().clone();
     let key = idempotency_key(&headers)?;
-    let taking::Taken { plan, files, upload: resumable, budget } = taking::take(&state, &who, request).await?;
+    let taking::Taken { plan, files, upload: resumable, parent, budget } = taking::take(&state, &who, request).await?;
     let (input, files) =
         tokio::task::spawn_blocking(move || (Store::describe(&files), files)).await.map_err(Problem::internal)?;
     let id = Uuid::now_v7();
@@ -164,19 +160,14 @@ async fn create(
         input_bytes: i64::try_from(bytes).map_err(Problem::internal)?,
         trace_id: trace.0.clone(),
         idempotency_key: key,
+        parent,
     };
     let submitted = store_and_submit(&state, &job, &input, files).await;
     drop(budget);
     let (mut row, replayed) = match submitted? {
         Submitted::New(row) => (*row, false),
         Submitted::Replayed(row) => (*row, true),
-        Submitted::Mismatch(row) => {
-            return Err(Problem::new(
-                StatusCode::UNPROCESSABLE_ENTITY,
-                "idempotency.mismatch",
-                format!("This Idempotency-Key was used for another scan or plan (job {}). Take a new key.", row.id),
-            ));
-        }
+        Submitted::Mismatch(row) => return Err(mismatch(&row)),
     };
     if !replayed {
         row.sent_by = state.audit_sent(&who, &trace.0, &row.id).await?;
@@ -187,6 +178,25 @@ async fn create(
     let waited = preferred_wait(&headers);
     let row = wait(&state, &who, row, waited, |row| row.state.is_final()).await?;
     Ok(accepted(row, waited, replayed))
+}
+
+/// A key that belongs to another request.
+pub(super) fn mismatch(row: &JobRow) -> Problem {
+    Problem::new(
+        StatusCode::UNPROCESSABLE_ENTITY,
+        "idempotency.mismatch",
+        format!("This Idempotency-Key was used for another scan or plan (job {}). Take a new key.", row.id),
+    )
+}
+
+/// A priority within its bounds.
+pub(super) fn priority_of(asked: Option<i64>) -> Result<i64, Problem> {
+    let priority = asked.unwrap_or(0);
+    if (-LARGEST_PRIORITY..=LARGEST_PRIORITY).contains(&priority) {
+        return Ok(priority);
+    }
+    let detail = format!("The priority must be {} to {LARGEST_PRIORITY}.", -LARGEST_PRIORITY);
+    Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail))
 }
 
 /// The input goes into the store first, so that a committed job never lacks it.
@@ -241,7 +251,7 @@ fn accepted(row: JobRow, waited: Option<Duration>, replayed: bool) -> Response {
     response
 }
 
-fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
+pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
     let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
     match value.to_str() {
         Ok(text) if (1..=LONGEST_KEY).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_graphic()) => {
@@ -308,6 +318,8 @@ pub(super) async fn changed(changes: &mut tokio::sync::broadcast::Receiver<Uuid>
 struct Listing {
     /// Only this state.
     state: Option<JobState>,
+    /// Only jobs that take this one's scan or result.
+    parent: Option<Uuid>,
     /// Only jobs older than this id (the `next` of a page holds it).
     before: Option<Uuid>,
     /// At most so many, 1 to 200; 50 without.
@@ -331,13 +343,14 @@ async fn list(
         return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
     }
     // One more than asked for tells whether there is a next page.
-    let page = Page { state: listing.state, before: listing.before, limit: limit + 1 };
+    let page = Page { state: listing.state, parent: listing.parent, before: listing.before, limit: limit + 1 };
     let mut rows = state.queue.jobs(&who.tenant, &page).await?;
     let more = i64::try_from(rows.len()).unwrap_or(i64::MAX) > limit;
     rows.truncate(usize::try_from(limit).unwrap_or(usize::MAX));
     let next = rows.last().filter(|_| more).map(|last| {
-        let filter = listing.state.map_or_else(String::new, |s| format!("&state={}", s.as_str()));
-        format!("/v1/jobs?before={}&limit={limit}{filter}", last.id)
+        let state = listing.state.map_or_else(String::new, |s| format!("&state={}", s.as_str()));
+        let parent = listing.parent.map_or_else(String::new, |id| format!("&parent={id}"));
+        format!("/v1/jobs?before={}&limit={limit}{state}{parent}", last.id)
     });
     let link = next.as_ref().and_then(|next| format!("<{next}>; rel=\"next\"").parse().ok());
     let mut response = Json(JobList { items: rows.into_iter().map(Job::from).collect(), next }).into_response();

@@ -2,6 +2,7 @@
 
 mod admin;
 mod artefacts;
+mod cohort;
 mod describe;
 mod events;
 mod examples;
@@ -12,6 +13,7 @@ mod links;
 mod listen;
 mod multipart;
 mod order;
+mod plans;
 mod portal;
 pub(crate) mod problems;
 mod range;
@@ -48,7 +50,7 @@ const SMALL_BODY: usize = 64 << 10;
         description = "Reconstructs blood vessels and their bifurcations from stacks of MRI or CT slices. \
                        Every error is an RFC 9457 problem with a stable `code`."
     ),
-    components(schemas(crate::error::Problem)),
+    components(schemas(crate::error::Problem, crate::cohort::Quantity)),
     modifiers(&Keys),
     tags(
         (name = "jobs", description = "Send a scan, follow it, end it"),
@@ -80,11 +82,13 @@ fn documented() -> OpenApiRouter<State> {
     OpenApiRouter::with_openapi(Document::openapi())
         .merge(jobs::router())
         .merge(order::router())
+        .merge(plans::router())
         .merge(links::router())
         .merge(uploads::router())
         .merge(stow::router())
         .merge(events::router())
         .merge(artefacts::router())
+        .merge(cohort::router())
         .merge(stats::router())
         .merge(workers::router())
         .merge(webhooks::router())

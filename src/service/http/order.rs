@@ -1,11 +1,10 @@
 //! What belongs to a job beside its state: the plan that it follows and its place in the queue.
 
-use super::jobs::job_of;
+use super::jobs::{job_of, priority_of};
 use super::problems::TraceId;
 use super::shapes::Job;
 use crate::auth::Principal;
 use crate::error::Problem;
-use crate::queue::submit::LARGEST_PRIORITY;
 use crate::state::State;
 use axum::Json;
 use axum::extract::{Extension, Path, Query, State as Shared};
@@ -56,11 +55,7 @@ async fn prioritise(
     Path(id): Path<String>,
     Query(place): Query<Place>,
 ) -> Result<Json<Job>, Problem> {
-    let priority = place.priority.unwrap_or(0);
-    if !(-LARGEST_PRIORITY..=LARGEST_PRIORITY).contains(&priority) {
-        let detail = format!("The priority must be {} to {LARGEST_PRIORITY}.", -LARGEST_PRIORITY);
-        return Err(Problem::new(StatusCode::BAD_REQUEST, "bad_request", detail));
-    }
+    let priority = priority_of(place.priority)?;
     let (id, row) = job_of(&state, &who, &id).await?;
     let moved = state.queue.prioritise(&who.tenant, id, priority).await?.ok_or_else(|| {
         let detail = format!("Only a job that waits can be moved; this one is {}.", row.state.as_str());

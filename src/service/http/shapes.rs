@@ -42,7 +42,7 @@ pub(super) struct InputShape {
 pub(super) struct Job {
     /// UUID v7.
     pub id: String,
-    /// `reconstruction`.
+    /// `reconstruction` or `variant`.
     pub kind: String,
     /// Where it stands.
     pub state: JobState,
@@ -62,6 +62,8 @@ pub(super) struct Job {
     pub cancel_requested: bool,
     /// Who sent it: the label of the key.
     pub sent_by: Option<String>,
+    /// The earlier job whose scan or result it takes.
+    pub parent: Option<String>,
     /// What was sent.
     pub input: InputShape,
     /// RFC 3339, UTC.
@@ -170,6 +172,7 @@ impl From<JobRow> for Job {
             max_attempts: row.max_attempts,
             cancel_requested: row.cancel_requested,
             sent_by: row.sent_by,
+            parent: row.parent,
             created_at: rfc3339(row.created_at),
             started_at: row.started_at.and_then(rfc3339),
             finished_at: row.finished_at.and_then(rfc3339),

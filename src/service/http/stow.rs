@@ -313,6 +313,7 @@ fn first(who: &Principal, trace: &TraceId, input: &Input) -> Result<NewJob, Prob
         input_bytes: i64::try_from(input.bytes()).map_err(Problem::internal)?,
         trace_id: trace.0.clone(),
         idempotency_key: None,
+        parent: None,
     })
 }
 

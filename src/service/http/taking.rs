@@ -8,8 +8,8 @@ use crate::auth::Principal;
 use crate::config::NamedBytes;
 use crate::error::Problem;
 use crate::intake::intake;
-use crate::queue::JobState;
 use crate::queue::submit::is_variant;
+use crate::queue::{JobRow, JobState};
 use crate::state::State;
 use axum::body::{Body, to_bytes};
 use axum::extract::{FromRequest as _, Multipart, Request};
@@ -33,6 +33,8 @@ pub(super) struct Taken {
     pub files: Vec<NamedBytes>,
     /// The resumable upload that it came by.
     pub upload: Option<Uuid>,
+    /// The earlier job whose scan or result it is.
+    pub parent: Option<Uuid>,
     /// Memory held until the files are stored.
     pub budget: Budget,
 }
@@ -81,21 +83,28 @@ pub(super) async fn take(state: &State, who: &Principal, request: Request) -> Re
     if !is_json(request.headers()) {
         let sent = multipart::read(state, form(state, who, request).await?).await?;
         let files = intake(&state.config, sent.files).await?;
-        return Ok(Taken { plan: sent.plan, files, upload: None, budget: sent.budget });
+        return Ok(Taken { plan: sent.plan, files, upload: None, parent: None, budget: sent.budget });
     }
     let body = json(request.into_body()).await?;
     if body.get("job").is_some() {
-        return of_job(state, who, read(body)?).await;
+        let FromJob { job, plan } = read(body)?;
+        let plan = plan_text(state, plan)?;
+        let (id, row) = job_of(state, who, &job).await?;
+        return of_job(state, id, &row, plan).await;
     }
     let named: FromUpload = read(body)?;
     let plan = plan_text(state, named.plan)?.unwrap_or_else(|| "{}".to_owned());
     let mut budget = Budget::default();
     let (file, id) = uploads::taken(state, who, &named.upload, &mut budget).await?;
     let files = intake(&state.config, vec![file]).await?;
-    Ok(Taken { plan, files, upload: Some(id), budget })
+    Ok(Taken { plan, files, upload: Some(id), parent: None, budget })
 }
 
-async fn json(body: Body) -> Result<Value, Problem> {
+/// A small JSON body.
+///
+/// # Errors
+/// `plan.too_large`, `bad_request`.
+pub(super) async fn json(body: Body) -> Result<Value, Problem> {
     let bytes = to_bytes(body, LARGEST_PLAN).await.map_err(|_| {
         let detail = format!("The body is larger than {LARGEST_PLAN} bytes, the most that a plan may have.");
         Problem::new(StatusCode::PAYLOAD_TOO_LARGE, "plan.too_large", detail)
@@ -118,10 +127,12 @@ fn plan_text(state: &State, plan: Option<Value>) -> Result<Option<String>, Probl
     Ok(text)
 }
 
-/// The scan of an earlier job, as it lies in the store: it was de-identified when it came.
-async fn of_job(state: &State, who: &Principal, named: FromJob) -> Result<Taken, Problem> {
-    let (id, row) = job_of(state, who, &named.job).await?;
-    let asked = plan_text(state, named.plan)?;
+/// The scan of an earlier job, as it lies in the store (it was de-identified when it came), or for a variant the sections of
+/// its result. Without a plan the earlier job's holds.
+///
+/// # Errors
+/// `job.no_input`, `job.no_result`; the store's.
+pub(super) async fn of_job(state: &State, id: Uuid, row: &JobRow, asked: Option<String>) -> Result<Taken, Problem> {
     if let Some(plan) = asked.as_ref().filter(|plan| is_variant(plan)) {
         return variant_of(state, id, plan.clone()).await;
     }
@@ -133,7 +144,7 @@ async fn of_job(state: &State, who: &Principal, named: FromJob) -> Result<Taken,
     let mut budget = Budget::default();
     budget.grow(state, usize::try_from(row.input_bytes).map_err(Problem::internal)?)?;
     let files = state.store.input(id, &row.input_digest).await?;
-    Ok(Taken { plan, files, upload: None, budget })
+    Ok(Taken { plan, files, upload: None, parent: Some(id), budget })
 }
 
 /// The artefact from which variants of a result are made.
@@ -148,7 +159,7 @@ async fn variant_of(state: &State, job: Uuid, plan: String) -> Result<Taken, Pro
     let mut budget = Budget::default();
     budget.grow(state, usize::try_from(found.bytes).map_err(Problem::internal)?)?;
     let bytes = state.store.bytes(&found.object_key, &found.digest).await?;
-    Ok(Taken { plan, files: vec![(SECTIONS.to_owned(), bytes.to_vec())], upload: None, budget })
+    Ok(Taken { plan, files: vec![(SECTIONS.to_owned(), bytes.to_vec())], upload: None, parent: Some(job), budget })
 }
 
 /// Whether the body is JSON.

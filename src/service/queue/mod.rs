@@ -6,13 +6,15 @@
 //! seen event N has seen everything before it. Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
-//! `submit`, `gather` and `read` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
+//! `submit`, `several`, `gather`, `read` and `results` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
 
 mod claim;
 mod finish;
 mod gather;
 mod keep;
 mod read;
+mod results;
+mod several;
 pub(crate) mod submit;
 mod types;
 
@@ -21,6 +23,8 @@ pub use finish::{Closing, Published};
 pub use gather::Grown;
 pub use keep::WorkerRow;
 pub use read::{Counts, Page};
+pub use results::{Finished, ResultRow};
+pub use several::{MOST_TOGETHER, Together as Several};
 pub use submit::{NewJob, Submitted};
 pub use types::{ArtefactRow, EventRow, JobRow, JobState};
 

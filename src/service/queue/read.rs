@@ -14,6 +14,8 @@ const SOME: &str = "SELECT * FROM job WHERE tenant = $1 AND id IN ($2, $3, $4, $
 pub struct Page {
     /// Only this state.
     pub state: Option<JobState>,
+    /// Only jobs that take this one's scan or result.
+    pub parent: Option<Uuid>,
     /// Only jobs older than this id.
     pub before: Option<Uuid>,
     /// At most so many.
@@ -69,6 +71,12 @@ impl Queue {
         let before = page.before.map_or_else(|| "g".to_owned(), |id| id.to_string());
         let mut values = args![tenant, before, page.limit];
         let sql = match page.state {
+            _ if page.parent.is_some() => {
+                let parent = page.parent.map(|id| id.to_string()).unwrap_or_default();
+                values.extend(args![parent, page.state.map_or("", JobState::as_str)]);
+                "SELECT * FROM job WHERE tenant = $1 AND id < $2 AND parent = $4 AND ($5 = '' OR state = $5) \
+                 ORDER BY id DESC LIMIT $3"
+            }
             None => "SELECT * FROM job WHERE tenant = $1 AND id < $2 ORDER BY id DESC LIMIT $3",
             Some(state) => {
                 values.extend(args![state.as_str()]);

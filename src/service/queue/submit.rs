@@ -33,6 +33,15 @@ pub struct NewJob {
     pub trace_id: String,
     /// Idempotency-Key of the request.
     pub idempotency_key: Option<String>,
+    /// The earlier job whose scan or result it takes.
+    pub parent: Option<Uuid>,
+}
+
+impl NewJob {
+    /// Whether an accepted job is of the same request.
+    pub(super) fn is_same(&self, row: &JobRow) -> bool {
+        row.input_digest == self.input_digest && row.plan == self.plan
+    }
 }
 
 /// What became of a submission.
@@ -206,13 +215,17 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
         let earlier = "SELECT * FROM job WHERE tenant = $1 AND idempotency_key = $2";
         if let Some(row) = tx.row(earlier, args![&job.tenant, key]).await? {
             let row = JobRow::of(&row)?;
-            let same = row.input_digest == job.input_digest && row.plan == job.plan;
+            let same = job.is_same(&row) && !super::several::has_others(tx, &job.tenant, key).await?;
             return Ok(if same { Submitted::Replayed(row.into()) } else { Submitted::Mismatch(row.into()) });
         }
     }
+    Ok(Submitted::New(inserted(tx, job).await?.into()))
+}
+
+pub(super) async fn inserted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<JobRow> {
     let insert = "INSERT INTO job (id, tenant, kind, state, priority, plan, input_digest, input_files, input_bytes, \
-        memory_mb, trace_id, idempotency_key, rank, run_at, created_at) \
-        VALUES ($1, $2, $12, 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms()) \
+        memory_mb, trace_id, idempotency_key, rank, run_at, created_at, parent) \
+        VALUES ($1, $2, $12, 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms(), $13) \
         RETURNING *";
     let values = args![
         job.id,
@@ -227,10 +240,11 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
         &job.idempotency_key,
         job.priority.saturating_mul(AGEING_MS),
         if is_variant(&job.plan) { "variant" } else { "reconstruction" },
+        job.parent.map(|id| id.to_string()),
     ];
     let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
     record(tx, &job.id.to_string(), "state").await?;
-    Ok(Submitted::New(JobRow::of(&row)?.into()))
+    JobRow::of(&row)
 }
 
 /// Whether a plan asks for a re-synthesis in place of a scan's reconstruction.

@@ -85,6 +85,8 @@ pub struct JobRow {
     pub error: Option<String>,
     /// Label of the key that sent it, where it is known.
     pub sent_by: Option<String>,
+    /// The earlier job whose scan or result it takes.
+    pub parent: Option<String>,
     /// Trace of the request that made it.
     pub trace_id: String,
     /// Grows with every visible change.
@@ -123,6 +125,7 @@ impl JobRow {
             cancel_requested: row.flag("cancel_requested")?,
             error: row.get("error")?,
             sent_by: row.get("sent_by")?,
+            parent: row.get("parent")?,
             trace_id: row.get("trace_id")?,
             revision: row.get("revision")?,
             created_at: row.get("created_at")?,

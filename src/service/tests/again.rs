@@ -58,6 +58,130 @@ async fn a_variant_is_made_from_the_sections_of_a_finished_job() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn several_plans_are_taken_together_or_not_at_all() {
+    let service = Service::with(|config| {
+        config.check_plan = |plan| {
+            let refused = Problem::new(StatusCode::UNPROCESSABLE_ENTITY, "plan.invalid", "it is bad")
+                .with_errors(vec![json!({"code": "plan.invalid", "message": "bad", "where": {"field": "note"}})]);
+            if String::from_utf8_lossy(plan).contains("bad") { Err(refused) } else { Ok(()) }
+        };
+    })
+    .await;
+    let parent = service.submit(&json!({"sections": true})).await;
+    service.ended(&parent).await;
+    let address = format!("/v1/jobs/{parent}/plans");
+    let send = |plans: Value, key: &str| {
+        service.request(Method::POST, &address).header("idempotency-key", key).json(&json!({"plans": plans})).send()
+    };
+    let variant = |k: u64| json!({"variant": {"changes": []}, "note": k});
+    let faulty =
+        body(send(json!([variant(1), {"note": "bad"}, variant(2), {"note": "bad"}]), "a").await.unwrap()).await;
+    let fields: Vec<&Value> = faulty["errors"].as_array().unwrap().iter().map(|e| &e["where"]["field"]).collect();
+    assert_eq!(
+        (&faulty["code"], fields),
+        (&json!("plan.invalid"), vec![&json!("plans[1].note"), &json!("plans[3].note")])
+    );
+    for (plans, status, code) in [
+        (json!([]), 422, "plans.number"),
+        (json!(vec![variant(0); 101]), 413, "plans.number"),
+        (json!({}), 422, "bad_request"),
+    ] {
+        assert_eq!(problem(send(plans, "a").await.unwrap(), status).await, code);
+    }
+    assert_eq!(
+        service.json("/v1/jobs").await["items"].as_array().unwrap().len(),
+        1,
+        "nothing of all that was accepted"
+    );
+    let plans = || json!([variant(1), variant(2), {"note": "the scan again"}]);
+    let first = send(plans(), "a").await.unwrap();
+    assert_eq!(first.status(), StatusCode::ACCEPTED);
+    let first = body(first).await;
+    let ids = |told: &Value| -> Vec<String> {
+        told["items"].as_array().unwrap().iter().map(|j| j["id"].as_str().unwrap().to_owned()).collect()
+    };
+    let again = send(plans(), "a").await.unwrap();
+    assert_eq!((again.status(), &again.headers()["idempotency-replayed"]), (StatusCode::OK, &"true".parse().unwrap()));
+    assert_eq!(ids(&body(again).await), ids(&first));
+    assert_eq!(problem(send(json!([variant(1)]), "a").await.unwrap(), 422).await, "idempotency.mismatch");
+    let kinds = ["variant", "variant", "reconstruction"];
+    for (id, kind) in ids(&first).iter().zip(kinds) {
+        let done = service.ended(id).await;
+        assert_eq!(
+            (&done["state"], &done["kind"], &done["parent"]),
+            (&json!("succeeded"), &json!(kind), &json!(parent))
+        );
+    }
+    let mine = service.json(&format!("/v1/jobs?parent={parent}&state=succeeded&limit=2")).await;
+    assert_eq!(ids(&mine), [ids(&first)[2].clone(), ids(&first)[1].clone()]);
+    assert!(mine["next"].as_str().unwrap().contains(&parent));
+    let orphan = service.submit(&json!({})).await;
+    service.ended(&orphan).await;
+    let without =
+        service.request(Method::POST, &format!("/v1/jobs/{orphan}/plans")).json(&json!({"plans": [{}, variant(1)]}));
+    assert_eq!(problem(without.send().await.unwrap(), 409).await, "job.no_result");
+    assert_eq!(service.json("/v1/jobs").await["items"].as_array().unwrap().len(), 5, "nor its first plan");
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn several_plans_may_not_copy_more_than_one_call_may_bring() {
+    let service = Service::with(|config| config.max_body = 40).await;
+    let first = service.submit(&json!({})).await;
+    service.ended(&first).await;
+    let send = |count: usize| {
+        let plans = json!({"plans": vec![json!({}); count]});
+        service.request(Method::POST, &format!("/v1/jobs/{first}/plans")).json(&plans).send()
+    };
+    assert_eq!(send(3).await.unwrap().status(), StatusCode::ACCEPTED);
+    let kept = support::files(&service.data().join("store")).len();
+    assert_eq!(problem(send(4).await.unwrap(), 413).await, "plans.too_large");
+    assert_eq!(support::files(&service.data().join("store")).len(), kept, "what was put for it is taken away");
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_table_of_jobs_names_those_that_are_meant() {
+    let service = Service::start().await;
+    let first = service.submit(&json!({"sections": true})).await;
+    service.ended(&first).await;
+    let made =
+        service.request(Method::POST, "/v1/jobs").json(&json!({"job": first, "plan": {"variant": {"changes": []}}}));
+    let second = body(made.send().await.unwrap()).await["id"].as_str().unwrap().to_owned();
+    service.ended(&second).await;
+    let failed = service.submit(&json!({"do": "input"})).await;
+    service.ended(&failed).await;
+    let jobs = async |query: &str| -> Vec<String> {
+        let told = service.json(&format!("/v1/cohort{query}")).await;
+        told["results"]
+            .as_array()
+            .unwrap_or_else(|| panic!("{told}"))
+            .iter()
+            .map(|r| r["job"].as_str().unwrap().to_owned())
+            .collect()
+    };
+    assert_eq!(jobs("").await, [second.clone(), first.clone()]);
+    assert_eq!(jobs("?job_kind=variant").await, std::slice::from_ref(&second));
+    assert_eq!(
+        jobs(&format!("?id={first},{second}&quantity=deg,area_mm2&kind=angle&branch=1,2")).await,
+        [first.clone(), second.clone()]
+    );
+    assert!(jobs("?created_after=2999-01-01T00:00:00Z").await.is_empty());
+    assert_eq!(jobs("?created_before=2999-01-01T00:00:00Z&without_warnings=true&name=graft").await.len(), 2);
+    let csv = service.request(Method::GET, "/v1/cohort").header("accept", "text/csv").send().await.unwrap();
+    assert!(csv.headers()["content-type"].to_str().unwrap().starts_with("text/csv"));
+    assert_eq!(csv.text().await.unwrap().lines().next(), Some("job"));
+    let asked = |query: &str| service.request(Method::GET, &format!("/v1/cohort{query}")).send();
+    assert_eq!(problem(asked(&format!("?id={failed}")).await.unwrap(), 404).await, "not_found");
+    for odd in ["?quantity=width", "?id=1", "?branch=x", "?kind=", "?created_after=now", "?page=2"] {
+        assert_eq!(problem(asked(odd).await.unwrap(), 400).await, "bad_request", "{odd}");
+    }
+    let picture = service.request(Method::GET, "/v1/cohort").header("accept", "image/png").send().await.unwrap();
+    assert_eq!(problem(picture, 406).await, "not_acceptable");
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_cancelled_jobs_scan_is_gone() {
     let service = Service::with(|config| config.workers = 0).await;
     let id = service.submit(&json!({})).await;

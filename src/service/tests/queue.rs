@@ -7,7 +7,8 @@ mod support;
 use service::auth::tenants;
 use service::db::{Db, Scope};
 use service::queue::{
-    ArtefactRow, Beat, Claim, Closing, JobState, NewJob, Page, Published, Queue, Room, Submitted, Verdict,
+    ArtefactRow, Beat, Claim, Closing, Finished, JobState, NewJob, Page, Published, Queue, Room, Several, Submitted,
+    Verdict,
 };
 use service::{Config, Problem};
 use std::collections::BTreeSet;
@@ -64,6 +65,8 @@ on_both! {
     a_tenant_stays_under_its_cap
     a_job_waits_for_memory
     a_key_makes_one_job
+    a_key_makes_several_jobs_together
+    finished_jobs_are_found_by_time_and_kind
     a_failed_unit_leaves_the_others_alone
     cancel_by_filter
     retry_and_hand_back
@@ -90,6 +93,7 @@ fn new(tenant: &str) -> NewJob {
         memory_mb: 0,
         trace_id: "t".to_owned(),
         idempotency_key: None,
+        parent: None,
     }
 }
 
@@ -324,6 +328,59 @@ async fn a_key_makes_one_job(b: Bench) {
     assert!(matches!(q.submit(&elsewhere).await.unwrap(), Submitted::New(_)), "a key belongs to its tenant");
 }
 
+async fn a_key_makes_several_jobs_together(b: Bench) {
+    let q = &b.queue;
+    let plan = |text: &str| NewJob { plan: text.to_owned(), idempotency_key: Some("k".into()), ..new("default") };
+    let three = || [plan("{}"), plan("{\"a\":1}"), plan("{\"a\":2}")];
+    let tries = (0..6)
+        .map(|_| (q.clone(), three()))
+        .map(|(q, jobs)| tokio::spawn(async move { q.submit_together(&jobs).await.unwrap() }));
+    let (mut fresh, mut seen) = (0, BTreeSet::new());
+    for one in tries.collect::<Vec<_>>() {
+        let (Several::New(rows) | Several::Replayed(rows)) = one.await.unwrap() else {
+            panic!("it is the same request")
+        };
+        fresh += usize::from(seen.insert(rows.iter().map(|row| row.id.clone()).collect::<Vec<_>>()));
+        assert_eq!(rows.iter().map(|row| row.plan.as_str()).collect::<Vec<_>>(), ["{}", "{\"a\":1}", "{\"a\":2}"]);
+    }
+    assert_eq!((fresh, q.jobs("default", &Page { limit: 9, ..Page::default() }).await.unwrap().len()), (1, 3));
+    for odd in [&three()[..2], &[plan("{}"), plan("{}"), plan("{}")], &[&three()[..], &[plan("{\"a\":3}")]].concat()] {
+        assert!(matches!(q.submit_together(odd).await.unwrap(), Several::Mismatch(_)));
+    }
+    assert!(matches!(q.submit(&plan("{}")).await.unwrap(), Submitted::Mismatch(_)), "one job is another request");
+    // One that cannot be written takes the others with it.
+    let taken = new("default");
+    assert!(matches!(q.submit(&taken).await.unwrap(), Submitted::New(_)));
+    assert!(q.submit_together(&[new("default"), taken, new("default")]).await.is_err());
+    assert_eq!(q.jobs("default", &Page { limit: 9, ..Page::default() }).await.unwrap().len(), 4);
+}
+
+async fn finished_jobs_are_found_by_time_and_kind(b: Bench) {
+    let q = &b.queue;
+    let mut done = Vec::new();
+    for plan in ["{}", "{\"variant\": {\"changes\": []}}", "{}"] {
+        let id = add(q, |job| job.plan = plan.to_owned()).await;
+        let held = claim(q).await.unwrap();
+        q.close(&held, &success()).await.unwrap();
+        done.insert(0, id.to_string());
+    }
+    let waiting = add(q, |_| {}).await;
+    sql(q, "UPDATE job SET created_at = 1000 * (SELECT COUNT(*) FROM job AS older WHERE older.id <= job.id)").await;
+    let all = || Finished { after: i64::MIN, before: i64::MAX, kind: "", limit: 9 };
+    let found = async |wanted: Finished| -> Vec<String> {
+        q.finished("default", &wanted).await.unwrap().into_iter().map(|row| row.job).collect()
+    };
+    assert_eq!(found(all()).await, done);
+    assert_eq!(found(Finished { limit: 2, ..all() }).await, done[..2]);
+    assert_eq!(found(Finished { kind: "variant", ..all() }).await, done[1..2]);
+    assert_eq!(found(Finished { after: 1000, before: 3000, ..all() }).await, done[1..]);
+    assert!(q.finished("ward", &all()).await.unwrap().is_empty());
+    assert!(q.finished_job("default", waiting).await.unwrap().is_none(), "it has no result");
+    let first = Uuid::parse_str(&done[0]).unwrap();
+    assert_eq!(q.finished_job("default", first).await.unwrap().unwrap().artefact.name, "result.json");
+    assert!(q.finished_job("ward", first).await.unwrap().is_none());
+}
+
 async fn a_failed_unit_leaves_the_others_alone(b: Bench) {
     let q = &b.queue;
     let tries = (0..20).map(|k| {
@@ -429,7 +486,8 @@ async fn pages_follow_the_key(b: Bench) {
     ids.reverse();
     let (mut seen, mut before) = (Vec::new(), None);
     loop {
-        let page = q.jobs("default", &Page { before, limit: 3, state: Some(JobState::Queued) }).await.unwrap();
+        let page =
+            q.jobs("default", &Page { before, limit: 3, state: Some(JobState::Queued), parent: None }).await.unwrap();
         if page.is_empty() {
             break;
         }

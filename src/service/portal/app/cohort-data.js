@@ -1,45 +1,28 @@
-// The rows of the cohort: one per finished job, from its result. The one place that knows where they come from.
-import { filePath, json, lasting } from "./net.js";
-import { mainJunction } from "./result.js";
+// The rows of the cohort: one per finished job, from the service's table. The one place that knows its shape.
+import { json } from "./net.js";
 
-const AT_ONCE = 6;
-const MOST = 1000;
+const QUANTITIES = "deg,diameter_mm,length_mm,stenosis_area_ratio";
+const KEYS = { diameter_mm: "diameter", length_mm: "length", stenosis_area_ratio: "stenosis" };
 
-function rowOf(job, found) {
-  const junction = mainJunction(found);
-  const row = { id: job.id, at: job.created_at, priority: job.priority, slices: found.input.slices, spacing: found.input.spacing_mm[2], warnings: found.warnings.length, volume: found.surface.volume_mm3 };
-  for (const angle of junction?.angles ?? []) row[`angle.${angle.name}`] = angle.value;
-  for (const branch of found.branches) {
-    if (branch.role === "other") continue;
-    row[`diameter.${branch.role}`] = branch.diameter_mm;
-    row[`length.${branch.role}`] = branch.length_mm;
-    if (branch.stenosis) row[`stenosis.${branch.role}`] = 100 * (1 - branch.stenosis.area_ratio);
-  }
-  return row;
+// What a row of the service's table is called here, or null where it is not shown: of several junctions the main one's
+// angles count, as in the report.
+function keyOf(line, main) {
+  if (line.kind === "angle") return line.id === main ? `angle.${line.name}` : null;
+  return line.name === "other" ? null : `${KEYS[line.quantity]}.${line.name}`;
 }
 
-// Calls onRows with the rows so far, newest first, and how many are still to come.
-export async function cohort(onRows, signal) {
-  const jobs = [];
-  let next = "/v1/jobs?state=succeeded&limit=200";
-  while (next && jobs.length < MOST) {
-    const page = await json(next, { signal });
-    jobs.push(...page.items);
-    next = page.next;
+// asked: {created_after?, created_before?, job_kind?}. Newest first.
+export async function cohort(asked, signal) {
+  const query = new URLSearchParams({ quantity: QUANTITIES });
+  for (const [key, value] of Object.entries(asked)) if (value) query.set(key, value);
+  const found = await json(`/v1/cohort?${query}`, { signal });
+  const rows = new Map(found.results.map((r) => [r.job, { id: r.job, at: r.created_at, slices: r.slices, spacing: r.slice_spacing_mm, warnings: r.warnings, volume: r.volume_mm3 }]));
+  const main = new Map(found.results.map((r) => [r.job, r.main_junction]));
+  for (const line of found.rows) {
+    const key = keyOf(line, main.get(line.job));
+    if (key) rows.get(line.job)[key] ??= line.quantity === "stenosis_area_ratio" && line.value !== null ? 100 * (1 - line.value) : line.value;
   }
-  const rows = new Array(jobs.length);
-  let done = 0;
-  const work = jobs.map((job, i) => ({ job, i }));
-  const take = async () => {
-    for (let one = work.shift(); one && !signal.aborted; one = work.shift()) {
-      // A job may be erased, or may have made no numbers: it is left out.
-      rows[one.i] = await lasting(filePath(one.job.id, "result.json")).then((found) => rowOf(one.job, found)).catch(() => null);
-      done += 1;
-      if (done % 10 === 0) onRows(rows.filter(Boolean), jobs.length - done);
-    }
-  };
-  await Promise.all(Array.from({ length: AT_ONCE }, take));
-  if (!signal.aborted) onRows(rows.filter(Boolean), 0);
+  return [...rows.values()];
 }
 
 // Keys of values that some row has.

@@ -3,6 +3,7 @@ import { card, download, field, h, select, table } from "./dom.js";
 import { cohort, csv, quantities } from "./cohort-data.js";
 import { boxes, scatter } from "./spread.js";
 import { finite } from "./plot.js";
+import { setQuery } from "./router.js";
 import { angleName, has, number, t, when } from "./text.js";
 
 export function quantityName(key) {
@@ -11,26 +12,37 @@ export function quantityName(key) {
   return role ? t(`cohort.${family}_of`, { role: has(`role.${role}`) ? t(`role.${role}`) : role }) : t(`cohort.${family}`);
 }
 
-export async function showCohort(box, { signal }) {
-  const view = { rows: [], keys: [], x: "", y: "", by: "", low: "", high: "" };
+const KINDS = ["", "reconstruction", "variant"];
+
+export async function showCohort(box, { query, signal }) {
+  const asked = Object.fromEntries(["from", "to", "kind"].map((key) => [key, query.get(key) ?? ""]));
   const body = h("div", { class: "stack" });
-  const status = h("p", { class: "soft", role: "status" }, t("cohort.reading"));
-  box.append(h("h1", {}, t("title.cohort")), status, body);
-  let built = "";
-  await cohort((rows, left) => {
-    Object.assign(view, { rows, keys: quantities(rows) });
-    status.textContent = left > 0 ? t("cohort.left", { n: left }) : t("cohort.count", { n: rows.length });
+  const status = h("p", { class: "soft", role: "status" });
+  const read = async () => {
+    setQuery(asked);
+    status.textContent = t("cohort.reading");
+    const rows = await cohort({ created_after: midnight(asked.from, 0), created_before: midnight(asked.to, 1), job_kind: asked.kind }, signal);
+    if (signal.aborted) return;
+    status.textContent = t("cohort.count", { n: rows.length });
     if (rows.length === 0) return body.replaceChildren(h("p", { class: "empty" }, t("cohort.none")));
-    const angles = view.keys.filter((key) => key.startsWith("angle."));
-    view.x ||= angles[0] ?? view.keys[0];
-    view.y ||= angles[1] ?? view.keys[1] ?? view.keys[0];
-    view.by ||= view.x;
-    if (built !== view.keys.join()) {
-      built = view.keys.join();
-      build(body, view);
-    }
+    const keys = quantities(rows);
+    const angles = keys.filter((key) => key.startsWith("angle."));
+    const view = { rows, keys, x: angles[0] ?? keys[0], y: angles[1] ?? keys[1] ?? keys[0], by: angles[0] ?? keys[0], low: "", high: "" };
+    build(body, view);
     view.draw();
-  }, signal);
+  };
+  const again = (key, value) => { asked[key] = value; read().catch((e) => window.dispatchEvent(new CustomEvent("fault", { detail: e }))); };
+  const day = (key) => field(t(`cohort.${key}`), h("input", { type: "date", value: asked[key], onchange: (e) => again(key, e.target.value) }));
+  const kind = field(t("cohort.kind"), select(KINDS.map((key) => [key, t(`cohort.kind_${key || "all"}`)]), asked.kind, (value) => again("kind", value)));
+  box.append(h("h1", {}, t("title.cohort")), card(t("cohort.jobs"), h("div", { class: "filters" }, day("from"), day("to"), kind), status), body);
+  await read();
+}
+
+// The beginning of a day, or of a later one, where the reader is.
+function midnight(day, later) {
+  if (!day) return "";
+  const [year, month, date] = day.split("-").map(Number);
+  return new Date(year, month - 1, date + later).toISOString();
 }
 
 function build(body, view) {

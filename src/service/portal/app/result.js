@@ -11,6 +11,7 @@ import { rolesPanel } from "./roles.js";
 import { picture, Slices } from "./slices.js";
 import { countRoles, place, t } from "./text.js";
 import { scene } from "./scene.js";
+import { varyPanel } from "./vary.js";
 
 export function warnings(list) {
   if (!list?.length) return h("p", { class: "card fine" }, t("result.no_warnings"));
@@ -58,7 +59,7 @@ export async function showResult(box, job, { signal }) {
   function drawAngles() {
     const distance = h("div", { class: "contents" });
     const curve = (names) => distance.replaceChildren(...[distanceCard(shown.junction, names)].filter(Boolean));
-    angles.replaceChildren(...[chooser, shown.junction ? angleCard(shown.junction, (names) => { three.angles(shown.junction, names); curve(names); }) : card(t("angles.title"), h("p", {}, t("angles.none"))), embedded ? null : rolesPanel(job, found, signal)].filter(Boolean));
+    angles.replaceChildren(...[chooser, shown.junction ? angleCard(shown.junction, (names) => { three.angles(shown.junction, names); curve(names); }) : card(t("angles.title"), h("p", {}, t("angles.none"))), embedded ? null : rolesPanel(job, found, signal), embedded || !list.items.some((f) => f.name === "sections.json") ? null : varyPanel(job, found, signal)].filter(Boolean));
     if (shown.junction) curve(firstShown(shown.junction));
     curves.replaceChildren(...[distance, along(found, focus)].filter(Boolean));
     three.angles(shown.junction, firstShown(shown.junction));
