@@ -40,10 +40,16 @@ pub(crate) enum Command {
     Tenant(Tenant),
     /// Check that no line of the audit was changed, moved or taken out.
     VerifyAudit(VerifyAudit),
+    /// The angle table and the warnings of a finished reconstruction.
+    Show(Show),
     /// Print the API's description (OpenAPI 3.1, YAML).
     Openapi,
     /// Print the version.
     Version,
+    /// Print the manual's page (`vasculum man | man -l -`), or write one for each command.
+    Man(Man),
+    /// Print what a shell needs to complete these commands and options.
+    Completions(Completions),
     /// One job of a worker (its parent speaks to it over standard input and output).
     #[command(hide = true)]
     ExecJob(ExecJob),
@@ -300,6 +306,28 @@ pub(crate) struct Cohort {
     /// Rows and spreads as JSON on standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Show {
+    /// The folder of a finished reconstruction, or its result.json.
+    pub(crate) result: PathBuf,
+    /// The whole result.json.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args)]
+pub(crate) struct Man {
+    /// A folder for vasculum.1 and one page for each command, such as /usr/local/share/man/man1.
+    #[arg(long)]
+    pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args)]
+pub(crate) struct Completions {
+    /// The shell. For bash: `vasculum completions bash > /etc/bash_completion.d/vasculum`.
+    pub(crate) shell: clap_complete::Shell,
 }
 
 #[derive(Args)]

@@ -1,10 +1,10 @@
 //! `vasculum demo`: the main job from end to end through the service, beside the truth.
 
 use crate::arguments::{Demo, Image};
+use crate::jobs::{advance, bar};
 use crate::{phantoms, table};
 use anyhow::{Context, Result, bail};
 use futures::StreamExt;
-use indicatif::{ProgressBar, ProgressStyle};
 use phantom::Kind;
 use reqwest::{Client, multipart};
 use serde_json::Value;
@@ -123,8 +123,7 @@ fn zipped(folder: &Path) -> Result<Vec<u8>> {
 
 /// Follow the job's events to its end; gives its last state.
 async fn follow(client: &Client, address: &str, id: &str) -> Result<String> {
-    let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %")?;
-    let bar = ProgressBar::new(1000).with_style(style);
+    let bar = bar(1000);
     let request = client.get(format!("{address}/v1/jobs/{id}/events")).header("accept", "text/event-stream");
     let mut stream = request.send().await?.error_for_status()?.bytes_stream();
     let mut text = String::new();
@@ -135,10 +134,10 @@ async fn follow(client: &Client, address: &str, id: &str) -> Result<String> {
             let line: String = text.drain(..=end).collect();
             let Some(data) = line.strip_prefix("data:") else { continue };
             let event: Value = serde_json::from_str(data.trim())?;
-            bar.set_position((event["progress"].as_f64().unwrap_or(0.0) * 1000.0) as u64);
+            let told = event["stage"].as_str().unwrap_or(&stage);
+            advance(&bar, told, event["progress"].as_f64().unwrap_or(0.0), event["eta_s"].as_f64());
             if let Some(now) = event["stage"].as_str().filter(|now| *now != stage) {
                 stage = now.to_owned();
-                bar.set_message(stage.clone());
                 if bar.is_hidden() {
                     eprintln!("{stage}");
                 }

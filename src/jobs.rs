@@ -1,9 +1,10 @@
 //! `run`, `validate` and `exec-job`: the pipeline in this process.
 
-use crate::arguments::{ExecJob, Run, Validate};
-use crate::table;
+use crate::arguments::{ExecJob, Run, Show, Validate};
+use crate::{table, understood};
 use artefact::plan::Plan;
 use artefact::problem::Problem;
+use artefact::write;
 use exec::Ctx;
 use indicatif::{ProgressBar, ProgressStyle};
 use pipeline::{Event, Failure};
@@ -32,6 +33,18 @@ pub(crate) fn run(a: &Run) -> ExitCode {
     }
 }
 
+/// The table of a finished reconstruction, as `run` printed it.
+pub(crate) fn show(a: &Show) -> ExitCode {
+    let file = if a.result.is_dir() { a.result.join(write::RESULT_JSON) } else { a.result.clone() };
+    let read = std::fs::read(&file).and_then(|bytes| Ok(serde_json::from_slice::<Value>(&bytes)?));
+    match read {
+        Ok(result) if a.json => println!("{result:#}"),
+        Ok(result) => print!("{}", table::summary(&result)),
+        Err(e) => return report(&Failure::unreadable(&file, &e), a.json),
+    }
+    ExitCode::SUCCESS
+}
+
 /// What was understood of a scan and a plan; the input is told even where the segmentation is refused.
 pub(crate) fn validate(a: &Validate) -> ExitCode {
     let outcome = plan_of(a.plan.as_deref()).and_then(|plan| match a.pixels {
@@ -47,7 +60,7 @@ pub(crate) fn validate(a: &Validate) -> ExitCode {
     {
         return report(&failure, a.json);
     }
-    print!("{}", if a.json { format!("{:#}\n", understood.facts) } else { words(&understood.facts, 0) });
+    print!("{}", if a.json { format!("{:#}\n", understood.facts) } else { understood::words(&understood.facts) });
     understood.refusal.map_or(ExitCode::SUCCESS, |failure| report(&failure, a.json))
 }
 
@@ -121,34 +134,28 @@ pub(crate) fn report(failure: &Failure, as_json: bool) -> ExitCode {
 }
 
 pub(crate) fn summary(result: &Value, out: &Path) -> String {
-    let mut text = table::angles(result, None);
-    for warning in result["warnings"].as_array().map(Vec::as_slice).unwrap_or_default() {
-        text += &format!(
-            "warning {}: {}\n",
-            warning["code"].as_str().unwrap_or("?"),
-            warning["message"].as_str().unwrap_or("")
-        );
-    }
-    text + &format!("artefacts in {}\n", out.display())
+    let folder = out.display();
+    let (report, surface) = (write::REPORT_HTML, write::SURFACE_VTP);
+    table::summary(result)
+        + &format!("artefacts in {folder}\n  {report} has pictures and plots; {surface} opens in ParaView\n")
 }
 
-/// A JSON object as indented lines.
-fn words(value: &Value, depth: usize) -> String {
-    let indent = "  ".repeat(depth);
-    match value {
-        Value::Object(members) => members
-            .iter()
-            .map(|(name, v)| match v {
-                Value::Object(_) => format!("{indent}{name}\n{}", words(v, depth + 1)),
-                Value::Array(items) if items.iter().any(Value::is_object) => {
-                    let lines: String = items.iter().map(|i| format!("{indent}  - {i}\n")).collect();
-                    format!("{indent}{name}\n{lines}")
-                }
-                _ => format!("{indent}{name}: {v}\n"),
-            })
-            .collect(),
-        other => format!("{indent}{other}\n"),
-    }
+/// A bar with the stage and the time left, within 80 columns.
+pub(crate) fn bar(length: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{prefix:<10} {bar:36} {percent:>3} %  {msg}");
+    ProgressBar::new(length).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// Where a job stands, on a bar of 1000.
+pub(crate) fn advance(bar: &ProgressBar, stage: &str, progress: f64, eta_s: Option<f64>) {
+    bar.set_prefix(stage.to_owned());
+    bar.set_message(eta_s.filter(|s| *s >= 0.5).map_or(String::new(), left));
+    bar.set_position((progress * 1000.0) as u64);
+}
+
+fn left(seconds: f64) -> String {
+    let s = seconds.round() as u64;
+    if s < 90 { format!("{s} s left") } else { format!("{} min {:02} s left", s / 60, s % 60) }
 }
 
 /// A bar on a terminal, one line per stage elsewhere.
@@ -159,9 +166,7 @@ pub(crate) struct Shown {
 
 impl Shown {
     pub(crate) fn new() -> Self {
-        let style = ProgressStyle::with_template("{msg:14} {bar:40} {percent:>3} %")
-            .unwrap_or_else(|_| ProgressStyle::default_bar());
-        let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(1000).with_style(style));
+        let bar = std::io::stderr().is_terminal().then(|| bar(1000));
         Self { bar, stage: Mutex::default() }
     }
     pub(crate) fn show(&self, e: &Event<'_>) {
@@ -171,11 +176,7 @@ impl Shown {
             e.stage.clone_into(&mut stage);
         }
         match &self.bar {
-            Some(bar) => {
-                let left = e.eta_s.map_or(String::new(), |s| format!(" {s:.0} s"));
-                bar.set_message(format!("{}{left}", e.stage));
-                bar.set_position((e.progress * 1000.0) as u64);
-            }
+            Some(bar) => advance(bar, e.stage, e.progress, e.eta_s),
             None if is_new => eprintln!("{}", e.stage),
             None => {}
         }

@@ -5,9 +5,11 @@ mod cohorts;
 mod demo;
 mod isolation;
 mod jobs;
+mod manuals;
 mod phantoms;
 mod serving;
 mod table;
+mod understood;
 mod variants;
 
 use arguments::{Arguments, Command};
@@ -32,7 +34,10 @@ fn main() -> ExitCode {
         Command::Tenant(a) => serving::tenant(a),
         Command::VerifyAudit(a) => serving::verify_audit(a),
         Command::Demo(a) => demo::demo(&a),
+        Command::Show(a) => jobs::show(&a),
         Command::Openapi => serving::openapi(),
+        Command::Man(a) => manuals::man(&a),
+        Command::Completions(a) => manuals::completions(&a),
         Command::Version => {
             println!("vasculum {}", env!("CARGO_PKG_VERSION"));
             ExitCode::SUCCESS

@@ -75,6 +75,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     tools::deploy()?;
     tools::pacs()?;
     tools::strace()?;
+    tools::groff()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge

@@ -109,6 +109,14 @@ pub(crate) fn deploy() -> Result<()> {
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
 }
 
+/// What reads the manual.
+pub(crate) fn groff() -> Result<()> {
+    if shell::has("groff") {
+        return Ok(());
+    }
+    apt("groff (it reads the pages of the manual)", &["groff-base"])
+}
+
 /// What asks a service as often as it can.
 pub(crate) fn wrk() -> Result<()> {
     if shell::has("wrk") {
