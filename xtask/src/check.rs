@@ -76,6 +76,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     tools::pacs()?;
     tools::strace()?;
     tools::groff()?;
+    tools::jq()?;
+    let node = tools::node_packages()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
         judge
@@ -85,10 +87,10 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
             .env("VASCULUM_OUT", &out)
             .env("VASCULUM_SCAN", &scan)
             .env("SURFACES", &surfaces)
+            .env("VASCULUM_NODE", &node)
             .env("VASCULUM_S3S", tools::s3()?);
         shell::run(judge)?;
     }
-    let node = tools::node_packages()?;
     tools::browser()?;
     for script in scripts("tests/js", "mjs")? {
         // modules resolve packages from their own folder: run a copy beside node_modules

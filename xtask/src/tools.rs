@@ -31,11 +31,20 @@ const PYTHON_PACKAGES: &[&str] = &[
     "podman-compose==1.6.0",
     "dicomweb-client==0.61.2",
     "requests<3",
+    "openapi-python-client==0.29.1",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
-const NODE_PACKAGES: &[&str] =
-    &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1", "tus-js-client@4.3.1", "axe-core@4.14.1"];
+const NODE_PACKAGES: &[&str] = &[
+    "gltf-validator@2.0.0-dev.3.10",
+    "playwright-core@1.65.1",
+    "tus-js-client@4.3.1",
+    "axe-core@4.14.1",
+    "openapi-typescript@7.13.0",
+    "openapi-fetch@0.17.0",
+    "typescript@5.9.3",
+    "@types/node@20",
+];
 
 /// Build the release binary (with the portal) and give its path.
 pub(crate) fn release_binary() -> Result<PathBuf> {
@@ -107,6 +116,14 @@ pub(crate) fn deploy() -> Result<()> {
         return Ok(());
     }
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
+}
+
+/// What reads JSON in a shell, for the guide's commands.
+pub(crate) fn jq() -> Result<()> {
+    if shell::has("jq") && shell::has("curl") {
+        return Ok(());
+    }
+    apt("jq and curl (the guide's commands are run)", &["jq", "curl"])
 }
 
 /// What reads the manual.
