@@ -77,6 +77,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     tools::strace()?;
     tools::groff()?;
     tools::jq()?;
+    tools::gmsh(&python)?;
     let node = tools::node_packages()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);

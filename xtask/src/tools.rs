@@ -5,7 +5,7 @@
 use crate::shell;
 use anyhow::{Context, Result, bail};
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Programs that judge our files; versions are pinned so that a green run stays green.
 const PYTHON_PACKAGES: &[&str] = &[
@@ -32,6 +32,8 @@ const PYTHON_PACKAGES: &[&str] = &[
     "dicomweb-client==0.61.2",
     "requests<3",
     "openapi-python-client==0.29.1",
+    "gmsh==4.15.2",
+    "meshio==5.3.5",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
@@ -116,6 +118,17 @@ pub(crate) fn deploy() -> Result<()> {
         return Ok(());
     }
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
+}
+
+/// Libraries that Gmsh from PyPI wants though it opens no window; `python` is the interpreter that has it.
+pub(crate) fn gmsh(python: &Path) -> Result<()> {
+    let mut ask = shell::command(python);
+    ask.args(["-c", "import gmsh"]);
+    if shell::succeeds(ask) {
+        return Ok(());
+    }
+    let packages = ["libglu1-mesa", "libxcursor1", "libxft2", "libxinerama1", "libxrender1", "libgomp1"];
+    apt("libraries of Gmsh (it fills our surface with tetrahedra)", &packages)
 }
 
 /// What reads JSON in a shell, for the guide's commands.

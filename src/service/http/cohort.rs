@@ -21,7 +21,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 use uuid::Uuid;
 
-/// Most jobs of one table: 36 MB of JSON (1.2 MB gzipped) and as much memory again.
+/// Most jobs of one table: 145,000 rows, 25 MB of JSON (0.7 MB gzipped), 130 MB of memory while it is made.
 const MOST_JOBS: i64 = 5000;
 /// Most ids of one call.
 const MOST_IDS: usize = 200;
