@@ -232,6 +232,10 @@ pub(crate) struct Run {
     /// plan.json.
     #[arg(long)]
     pub(crate) plan: Option<PathBuf>,
+    /// The folder of a finished reconstruction of the same scan that holds a field.bin: what other roles or settings of the mesh
+    /// do not change is taken from it (large scans keep one; `"outputs": ["field"]` of a plan asks for it).
+    #[arg(long)]
+    pub(crate) earlier: Option<PathBuf>,
     /// Threads (default: all cores; the bytes do not depend on it).
     #[arg(long)]
     pub(crate) threads: Option<usize>,
@@ -357,6 +361,8 @@ pub(crate) struct ExecJob {
     pub(crate) plan: PathBuf,
     #[arg(long)]
     pub(crate) out: PathBuf,
+    #[arg(long)]
+    pub(crate) earlier: Option<PathBuf>,
     #[arg(long, default_value_t = 0)]
     pub(crate) threads: usize,
 }

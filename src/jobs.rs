@@ -20,7 +20,7 @@ pub(crate) fn run(a: &Run) -> ExitCode {
     let outcome = plan_of(a.plan.as_deref()).and_then(|plan| {
         let ctx = context(a.threads)?;
         let shown = Shown::new();
-        let outcome = pipeline::run(&a.input, &plan, &a.out, &ctx, &|e| shown.show(e));
+        let outcome = pipeline::run_after(a.earlier.as_deref(), &a.input, &plan, &a.out, &ctx, &|e| shown.show(e));
         shown.finish();
         outcome
     });
@@ -79,7 +79,7 @@ pub(crate) fn exec(a: &ExecJob) -> ExitCode {
     let outcome = plan_of(Some(&a.plan)).and_then(|plan| {
         let ctx = context(Some(a.threads))?;
         die_with_parent();
-        pipeline::run(std::slice::from_ref(&a.input), &plan, &a.out, &ctx, &|e| {
+        pipeline::run_after(a.earlier.as_deref(), std::slice::from_ref(&a.input), &plan, &a.out, &ctx, &|e| {
             line(&json!({"stage": e.stage, "progress": e.progress, "eta_s": e.eta_s}));
         })
     });

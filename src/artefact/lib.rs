@@ -1,6 +1,7 @@
 //! Bytes to types and back: the only crate that knows a file format.
 
 pub mod cohort;
+pub mod field;
 mod named;
 pub mod plan;
 pub mod problem;

@@ -4,6 +4,10 @@
 //! maps keep their order and sums fold fixed chunks of [`CHUNK`] elements in order, so the bytes are the same for 1 and
 //! for 64 threads. `par_iter().sum()` on floats is what this replaces.
 
+mod recall;
+
+pub use recall::{Key, Recall};
+
 use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,6 +37,7 @@ pub struct Ctx {
     cancel: Arc<AtomicBool>,
     sink: Sink,
     range: (f64, f64),
+    recall: Option<Arc<dyn Recall>>,
 }
 
 impl Ctx {
@@ -45,7 +50,13 @@ impl Ctx {
             .num_threads(threads)
             .build()
             .map_err(|e| PoolError { threads, reason: e.to_string() })?;
-        Ok(Self { pool: Arc::new(pool), cancel: Arc::default(), sink: Arc::new(|_| {}), range: (0.0, 1.0) })
+        Ok(Self {
+            pool: Arc::new(pool),
+            cancel: Arc::default(),
+            sink: Arc::new(|_| {}),
+            range: (0.0, 1.0),
+            recall: None,
+        })
     }
     /// The same context with another progress sink, which is given the overall fraction, 0 to 1.
     #[must_use]

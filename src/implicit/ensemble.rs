@@ -14,6 +14,7 @@
 //! level at which contours are drawn is a field of its own, which neighbouring contours share.
 
 use crate::Error;
+use crate::conjugate::Coefficients;
 use crate::constraints::Constraints;
 use crate::interpolate::Solver;
 use crate::kernel::Centres;
@@ -70,50 +71,56 @@ struct Wave {
     amplitude: f64,
 }
 
+/// Coefficients and polynomials of `count` draws for a solved fit with scale `s` of the field. The same for any number of
+/// threads.
+pub(crate) fn solved(
+    c: &Constraints,
+    solver: &Solver<'_>,
+    (scale, s): (Scale, f64),
+    count: usize,
+    ctx: &Ctx,
+) -> Result<Vec<Coefficients>, Error> {
+    let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
+    let longest = longest(&points[..c.wall]);
+    let values = ctx.map_range(count, |number| {
+        let mut normal = Normal::new(number as u64);
+        let waves = waves(s, longest, &mut normal);
+        let mut values = errors(c, &mut normal);
+        let level = level_waves(&scale, &mut normal);
+        for (v, (level_mm, p)) in values.iter_mut().zip(c.level_mm.iter().zip(&points)) {
+            *v += level_mm * sum(&level, *p);
+        }
+        // an interior point was set off from its wall point and shares its error
+        for (k, (wall, _)) in c.interior.iter().enumerate() {
+            values[c.wall + k] += values[*wall];
+        }
+        for (v, p) in values.iter_mut().zip(&points) {
+            *v += sum(&waves, *p);
+        }
+        values
+    })?;
+    // the solver tells a progress of its own for every draw
+    let error = c.sigma_mm[..c.wall].iter().fold(0.0, |s, x| s + x) / c.wall.max(1) as f64;
+    let wanted = DRAW_MM[0].max(DRAW_SHARE * error);
+    solver.solve_many(&values, [wanted, wanted.max(DRAW_MM[1])], &ctx.part(0.0, 0.0))
+}
+
+/// The largest wave number, scaled: half the spacing of the wall points.
+fn longest(wall: &[[f64; 3]]) -> f64 {
+    (2.0 * std::f64::consts::TAU / spacing(wall).max(1e-4)).max(2.0 * WAVE_NUMBER_MIN)
+}
+
 impl Ensemble {
-    /// `count` draws for a solved fit with scale `s` of the field. The same for any number of threads.
-    pub(crate) fn new(
-        c: &Constraints,
-        solver: &Solver<'_>,
-        (scale, s): (Scale, f64),
-        count: usize,
-        ctx: &Ctx,
-    ) -> Result<Self, Error> {
+    /// The draws that [`solved`] gave coefficients of; their waves come from their numbers again.
+    pub(crate) fn of(c: &Constraints, (scale, s): (Scale, f64), solved: Vec<Coefficients>) -> Self {
         let points: Vec<[f64; 3]> = c.points.iter().map(|&p| scale.apply(p)).collect();
-        let longest = 2.0 * std::f64::consts::TAU / spacing(&points[..c.wall]).max(1e-4);
-        let fields = ctx.map_range(count, |number| {
-            let mut normal = Normal::new(number as u64);
-            let waves = waves(s, longest.max(2.0 * WAVE_NUMBER_MIN), &mut normal);
-            let mut values = errors(c, &mut normal);
-            let level = level_waves(&scale, &mut normal);
-            for (v, (level_mm, p)) in values.iter_mut().zip(c.level_mm.iter().zip(&points)) {
-                *v += level_mm * sum(&level, *p);
-            }
-            // an interior point was set off from its wall point and shares its error
-            for (k, (wall, _)) in c.interior.iter().enumerate() {
-                values[c.wall + k] += values[*wall];
-            }
-            for (v, p) in values.iter_mut().zip(&points) {
-                *v += sum(&waves, *p);
-            }
-            (waves, values)
-        })?;
-        let (waves, values): (Vec<Vec<Wave>>, Vec<Vec<f64>>) = fields.into_iter().unzip();
-        // the solver tells a progress of its own for every draw
-        let error = c.sigma_mm[..c.wall].iter().fold(0.0, |s, x| s + x) / c.wall.max(1) as f64;
-        let wanted = DRAW_MM[0].max(DRAW_SHARE * error);
-        let tolerance = [wanted, wanted.max(DRAW_MM[1])];
-        let solved = solver.solve_many(&values, tolerance, &ctx.part(0.0, 0.0))?;
-        let draws = waves
-            .into_iter()
-            .zip(solved)
-            .map(|(waves, (coefficients, polynomial))| Draw {
-                waves,
-                centres: Centres::new(&points, &coefficients),
-                polynomial,
-            })
-            .collect();
-        Ok(Self { draws, scale: Some(scale) })
+        let longest = if solved.is_empty() { 1.0 } else { longest(&points[..c.wall]) };
+        let draw = |(number, (coefficients, polynomial)): (usize, Coefficients)| Draw {
+            waves: waves(s, longest, &mut Normal::new(number as u64)),
+            centres: Centres::new(&points, &coefficients),
+            polynomial,
+        };
+        Self { draws: solved.into_iter().enumerate().map(draw).collect(), scale: Some(scale) }
     }
 }
 
@@ -308,7 +315,7 @@ mod tests {
         let (solution, solver) = solved(&problem, crate::Method::BySize, &ctx).unwrap();
         println!("solve with contrasts: {} iterations, {:.2} s", solution.iterations, start.elapsed().as_secs_f64());
         let start = clock();
-        Ensemble::new(&c, &solver, (scale, s), 24, &ctx).unwrap();
+        Ensemble::of(&c, (scale, s), super::solved(&c, &solver, (scale, s), 24, &ctx).unwrap());
         println!("24 draws: {:.2} s", start.elapsed().as_secs_f64());
     }
 

@@ -31,6 +31,10 @@ pub trait Field: Sync {
         ctx.chunks_mut(&mut out, POINTS_PER_TASK, |first, chunk| self.values(&xs[first..first + chunk.len()], chunk))?;
         Ok(out)
     }
+    /// Everything that its values depend on, for [`Ctx::recalled`]; `None` where values are too cheap to be kept.
+    fn numbers(&self) -> Option<Vec<f64>> {
+        None
+    }
     /// A box outside which f is negative or has no meaning.
     fn bounds(&self) -> Aabb<Patient>;
 }

@@ -8,14 +8,14 @@
 //! covariance s |x - x'|^3 and noise sigma_i^2, so that lambda_i = sigma_i^2 / s. The one unknown, s, maximises the
 //! restricted likelihood of clusters of neighbouring constraints. Nothing is tuned by hand.
 
-use crate::conjugate::Solution;
+use crate::conjugate::{Coefficients, Solution};
 use crate::constraints::{self, Constraints};
-use crate::ensemble::Ensemble;
+use crate::ensemble::{self, Ensemble};
 use crate::interpolate::{Problem, solved};
 use crate::roughness::roughness;
 use crate::system::Scale;
 use crate::variational::Variational;
-use crate::{Error, Field, Settings};
+use crate::{Error, Field, Method, Settings};
 use exec::Ctx;
 use imaging::Contours;
 use space::P3;
@@ -133,12 +133,75 @@ fn solve(
     ctx.progress(0.1);
     let problem = Problem { points: &points, noise: &noise, values: &c.values, tolerance: [tolerance, ACCEPTED_MM] };
     let share = if draws == 0 { 1.0 } else { 0.5 };
-    let (solution, solver) = solved(&problem, settings.method, &ctx.part(0.1, share))?;
+    let compute = || {
+        let (solution, solver) = solved(&problem, settings.method, &ctx.part(0.1, share))?;
+        accept(c, &noise, &solution.coefficients, contours)?;
+        let drawn = ensemble::solved(c, &solver, (scale, s), draws, &ctx.part(share, 1.0))?;
+        Ok::<_, Error>(packed(&solution, &drawn))
+    };
+    let key = key(c, (scale, s, &noise), (settings.method, tolerance, draws));
+    let key: Vec<&[f64]> = key.iter().map(Vec::as_slice).collect();
+    let known = ctx.recalled("fit", &key, compute)?;
+    let (solution, drawn) = unpacked(&known, c.points.len(), draws);
     let report = report(c, &noise, &points, &solution);
     accept(c, &noise, &solution.coefficients, contours)?;
-    let ensemble = Ensemble::new(c, &solver, (scale, s), draws, &ctx.part(share, 1.0))?;
+    let ensemble = Ensemble::of(c, (scale, s), drawn);
     let f = Variational::new(c.points.clone(), scale, &solution)?.with_constraints(c.wall, c.interior.len());
     Ok((f, report, ensemble))
+}
+
+/// All that a solution and its draws depend on.
+fn key(
+    c: &Constraints,
+    (scale, s, noise): (Scale, f64, &[f64]),
+    (method, tolerance, draws): (Method, f64, usize),
+) -> [Vec<f64>; 8] {
+    [
+        [&scale.numbers()[..], &[s, c.wall as f64, f64::from(method as u8), tolerance, draws as f64]].concat(),
+        c.points.iter().flat_map(|p| p.to_array()).collect(),
+        noise.to_vec(),
+        c.values.clone(),
+        c.sigma_mm.clone(),
+        c.level_mm.clone(),
+        c.curve.iter().map(|curve| curve.map_or(-1.0, |k| k as f64)).collect(),
+        c.interior.iter().flat_map(|(wall, offset)| [*wall as f64, *offset]).collect(),
+    ]
+}
+
+/// A solution and its draws as one list: condition, iterations, polynomial, coefficients, errors, then each draw's polynomial and
+/// coefficients.
+fn packed(solution: &Solution, drawn: &[Coefficients]) -> Vec<f64> {
+    let mut out = vec![solution.condition, solution.iterations as f64];
+    out.extend(solution.polynomial);
+    out.extend(&solution.coefficients);
+    out.extend(&solution.errors);
+    for (coefficients, polynomial) in drawn {
+        out.extend(polynomial);
+        out.extend(coefficients);
+    }
+    out
+}
+
+/// The reverse of [`packed`], for `n` constraints. A list that is too short, which nobody makes, gives zeros, and the residuals
+/// that follow refuse them.
+fn unpacked(list: &[f64], n: usize, draws: usize) -> (Solution, Vec<Coefficients>) {
+    let mut rest = list.iter().copied();
+    let mut take = |count: usize| -> Vec<f64> { (0..count).map(|_| rest.next().unwrap_or(0.0)).collect() };
+    let head = take(2);
+    let polynomial = |list: Vec<f64>| [list[0], list[1], list[2], list[3]];
+    let solution = Solution {
+        condition: head[0],
+        iterations: head[1] as usize,
+        polynomial: polynomial(take(4)),
+        coefficients: take(n),
+        errors: take(n),
+    };
+    let drawn = (0..draws).map(|_| {
+        let polynomial = polynomial(take(4));
+        (take(n), polynomial)
+    });
+    let drawn = drawn.collect();
+    (solution, drawn)
 }
 
 fn report(c: &Constraints, noise: &[f64], points: &[[f64; 3]], solution: &Solution) -> FitReport {

@@ -40,6 +40,11 @@ impl Centres {
         s
     }
 
+    /// Positions and coefficients as one list.
+    pub(crate) fn numbers(&self) -> Vec<f64> {
+        [&self.x, &self.y, &self.z, &self.c].into_iter().flatten().flatten().copied().collect()
+    }
+
     /// Number of centres.
     pub(crate) fn len(&self) -> usize {
         self.len

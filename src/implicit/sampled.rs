@@ -6,7 +6,7 @@
 
 use crate::filter::{Rows, Spans, to_coefficients, twiced};
 use crate::{Error, Field};
-use exec::Ctx;
+use exec::{Cancelled, Ctx};
 use space::{Aabb, DMat3, DVec3, Grid, P3, Patient, V3};
 use std::sync::Arc;
 
@@ -54,7 +54,7 @@ impl Sampled {
         let mut values = coarse_values(field, grid, ctx)?;
         let near = near_points(grid, wall, settings);
         let points: Vec<P3> = near.iter().map(|&i| position(grid, i)).collect();
-        for (&i, v) in near.iter().zip(field.values_of_many(&points, ctx)?) {
+        for (&i, v) in near.iter().zip(values_at(field, &points, ctx)?) {
             values[i] = v;
         }
         to_coefficients(&mut values, grid.size, ctx)?;
@@ -210,13 +210,20 @@ fn position(grid: &Grid, index: usize) -> P3 {
     grid.point(index % nx, index / nx % ny, index / (nx * ny))
 }
 
+/// Values of the field at lattice points: the most costly thing of all, so that an earlier run's are taken.
+fn values_at(field: &dyn Field, points: &[P3], ctx: &Ctx) -> Result<Vec<f64>, Cancelled> {
+    let Some(numbers) = field.numbers() else { return field.values_of_many(points, ctx) };
+    let flat: Vec<f64> = points.iter().flat_map(|p| p.to_array()).collect();
+    ctx.recalled("values", &[&numbers, &flat], || field.values_of_many(points, ctx))
+}
+
 /// All lattice values by trilinear interpolation of every fourth one.
 fn coarse_values(field: &dyn Field, grid: &Grid, ctx: &Ctx) -> Result<Vec<f64>, Error> {
     let n = grid.size.map(|n| (n - 1) / COARSE + 1);
     let points: Vec<P3> = (0..n[0] * n[1] * n[2])
         .map(|at| grid.point(at % n[0] * COARSE, at / n[0] % n[1] * COARSE, at / (n[0] * n[1]) * COARSE))
         .collect();
-    let knots = field.values_of_many(&points, ctx)?;
+    let knots = values_at(field, &points, ctx)?;
     let coarse = |i: usize, j: usize, k: usize| knots[i + n[0] * (j + n[1] * k)];
     let mut values = vec![0.0; grid.len()];
     let cell = |i: usize, n: usize| {

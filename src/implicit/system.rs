@@ -27,6 +27,11 @@ pub(crate) struct Scale {
 }
 
 impl Scale {
+    /// Centre and length as one list.
+    pub(crate) fn numbers(&self) -> [f64; 4] {
+        let [x, y, z] = self.centre.to_array();
+        [x, y, z, self.length]
+    }
     /// Centred on the mean; the farthest point is at distance 1.
     pub(crate) fn of(points: &[P3]) -> Self {
         let centre = P3::centroid(points).unwrap_or(P3::ORIGIN);

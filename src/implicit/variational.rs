@@ -65,6 +65,12 @@ impl Field for Variational {
         }
         Ok(out)
     }
+    fn numbers(&self) -> Option<Vec<f64>> {
+        let mut all = self.scale.numbers().to_vec();
+        all.extend(self.polynomial);
+        all.extend(self.centres.numbers());
+        Some(all)
+    }
     fn bounds(&self) -> Aabb<Patient> {
         self.bounds
     }

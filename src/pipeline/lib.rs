@@ -4,10 +4,11 @@
 mod facts;
 mod failure;
 mod folder;
+mod memory;
 mod reconstruct;
 mod source;
 mod step;
 
 pub use failure::Failure;
-pub use reconstruct::{Understood, input, run, understand, validate};
+pub use reconstruct::{Understood, input, run, run_after, understand, validate};
 pub use step::{Event, Observer};

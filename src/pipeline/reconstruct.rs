@@ -1,5 +1,6 @@
 //! From a scan to all artefacts.
 
+use crate::memory::Memory;
 use crate::step::{Steps, peak_memory_bytes};
 use crate::{Failure, Observer, folder};
 use crate::{facts, source};
@@ -15,6 +16,7 @@ use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
 use space::{FaultKind, Faulty, P3, Warning};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use surface::{
     Bounded, Displacement, Extension, PolygoniseSettings, Quality, RemeshSettings, Sizing, Topology, TriMesh,
 };
@@ -41,8 +43,25 @@ pub(crate) struct Wall {
 /// # Errors
 /// [`Failure`] of any stage; nothing is left behind.
 pub fn run(inputs: &[PathBuf], plan: &Plan, out: &Path, ctx: &Ctx, observer: Observer<'_>) -> Result<Value, Failure> {
+    run_after(None, inputs, plan, out, ctx, observer)
+}
+
+/// [`run`] after an earlier one on the same scan: what only the scan and the settings in common decide is taken from its
+/// field.bin (a file, or the folder that holds it), where there is one of this very program. The artefacts have the same bytes.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_after(
+    earlier: Option<&Path>,
+    inputs: &[PathBuf],
+    plan: &Plan,
+    out: &Path,
+    ctx: &Ctx,
+    observer: Observer<'_>,
+) -> Result<Value, Failure> {
     folder::refuse_foreign(out)?;
-    let (files, result) = reconstruct(inputs, plan, ctx, observer)?;
+    let memory = Arc::new(Memory::of(earlier));
+    let (files, result) = reconstruct(inputs, plan, &memory, &ctx.clone().with_recall(memory.clone()), observer)?;
     folder::publish(out, &files)?;
     observer(&crate::Event { stage: "done", progress: 1.0, eta_s: Some(0.0) });
     Ok(result)
@@ -52,6 +71,7 @@ pub fn run(inputs: &[PathBuf], plan: &Plan, out: &Path, ctx: &Ctx, observer: Obs
 fn reconstruct(
     inputs: &[PathBuf],
     plan: &Plan,
+    memory: &Memory,
     ctx: &Ctx,
     observer: Observer<'_>,
 ) -> Result<(Vec<NamedBytes>, Value), Failure> {
@@ -97,6 +117,7 @@ fn reconstruct(
         Ok::<_, write::Error>(files)
     })?;
     files.extend(variants(&wall).map_err(|e| Failure::of(&e))?);
+    files.extend(memory.artefact(plan.outputs.iter().any(|o| o == "field")));
     let result = files
         .first()
         .and_then(|f| serde_json::from_slice(&f.bytes).ok())
@@ -109,6 +130,7 @@ fn reconstruct(
         finished_at: Some(facts::now_utc()),
         input_digest: digest,
         plan: plan.clone(),
+        recalled: memory.recalled(),
         stages: steps.times.iter().map(facts::stage).collect(),
         peak_memory_bytes: Some(peak_memory_bytes()),
     };

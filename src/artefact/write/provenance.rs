@@ -34,6 +34,8 @@ pub struct Provenance {
     pub input_digest: String,
     /// The plan in force, defaults filled in.
     pub plan: Plan,
+    /// Results that an earlier run's field.bin gave.
+    pub recalled: usize,
     /// By stage, in order.
     pub stages: Vec<StageTime>,
     /// Largest resident memory of the process, bytes.
@@ -53,6 +55,7 @@ struct Document<'a> {
     peak_memory_bytes: Option<u64>,
     input: Input<'a>,
     plan: &'a Plan,
+    recalled: usize,
     stages: &'a [StageTime],
     artefacts: Vec<Artefact<'a>>,
 }
@@ -91,6 +94,7 @@ pub fn provenance(p: &Provenance, artefacts: &[NamedBytes]) -> Result<NamedBytes
         peak_memory_bytes: p.peak_memory_bytes,
         input: Input { digest: &p.input_digest },
         plan: &p.plan,
+        recalled: p.recalled,
         stages: &p.stages,
         artefacts: artefacts
             .iter()

@@ -30,6 +30,8 @@ pub struct Claim {
     pub memory_mb: i64,
     /// Trace of the request that made the job.
     pub trace_id: String,
+    /// The earlier job whose scan or result it takes.
+    pub parent: Option<String>,
 }
 
 impl Claim {
@@ -49,6 +51,7 @@ impl Claim {
             input_digest: row.get("input_digest")?,
             memory_mb: row.get("memory_mb")?,
             trace_id: row.get("trace_id")?,
+            parent: row.get("parent")?,
         })
     }
 }

@@ -1,6 +1,6 @@
 //! The child process of one job and its protocol.
 //!
-//! `EXE exec-job --input DIR --plan FILE --out DIR --threads N`, trace id in `VASCULUM_TRACE_ID`, beside `TMPDIR` the only
+//! `EXE exec-job --input DIR --plan FILE --out DIR --threads N [--earlier FILE]`, trace id in `VASCULUM_TRACE_ID`, beside `TMPDIR` the only
 //! variable: keys and passwords of the service are not its business. Its stdout carries one JSON object per line: first
 //! `{"isolation"}` with the barriers between it and the network, then `{"stage", "progress", "eta_s"}`, and
 //! `{"error": {...}}` last on failure; stderr is log text. Exit codes: 0 done, 2 input, 3 limit, 4 numeric, 130 cancelled, 1 our own fault. The child leads a process
@@ -85,6 +85,9 @@ impl Child {
         command.args(&config.executable_args).arg("exec-job");
         command.arg("--input").arg(folder.input()).arg("--plan").arg(folder.plan());
         command.arg("--out").arg(folder.out()).arg("--threads").arg(config.threads.to_string());
+        if folder.earlier().exists() {
+            command.arg("--earlier").arg(folder.earlier());
+        }
         command.env_clear().env("TMPDIR", folder.path()).env("VASCULUM_TRACE_ID", &claim.trace_id);
         command.current_dir(folder.path());
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());

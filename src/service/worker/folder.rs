@@ -4,6 +4,9 @@ use super::Owner;
 use crate::queue::Claim;
 use std::path::{Path, PathBuf};
 
+/// The artefact by which a job on the same scan is spared what this one computed.
+pub(super) const FIELD: &str = "field.bin";
+
 /// A working folder, removed when dropped.
 #[derive(Debug)]
 pub(super) struct Folder {
@@ -30,6 +33,11 @@ impl Folder {
     /// Where the plan lies.
     pub(super) fn plan(&self) -> PathBuf {
         self.path.join("plan.json")
+    }
+
+    /// Where what an earlier job left lies.
+    pub(super) fn earlier(&self) -> PathBuf {
+        self.path.join(FIELD)
     }
 
     /// Where the artefacts appear.

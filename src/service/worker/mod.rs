@@ -23,6 +23,7 @@ pub use owner::Owner;
 use crate::config::Config;
 use crate::error::Problem;
 use crate::media::media_type;
+use crate::queue::submit::is_variant;
 use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict, WorkerRow};
 use crate::store::Store;
 use crate::traces::{Course, Traces};
@@ -117,6 +118,10 @@ impl Worker {
             };
         }
         tokio::fs::write(folder.plan(), &claim.plan).await?;
+        if let Err(error) = self.fetch_earlier(claim, &folder).await {
+            // It would only have saved time.
+            tracing::warn!(job = %claim.id, cause = %error, "what the earlier job left cannot be had");
+        }
         let mut child = Child::start(&self.config, &folder, claim, self.memory.each())?;
         let ended = self.watch(&mut child, held, claim, course).await?;
         let closing = match ended {
@@ -133,6 +138,20 @@ impl Worker {
         };
         folder.remove().await;
         Ok(closing)
+    }
+
+    /// What an earlier job on the same scan left for this one. A variant has another scan: none.
+    async fn fetch_earlier(&self, claim: &Claim, folder: &Folder) -> anyhow::Result<()> {
+        let Some(parent) = claim.parent.as_ref().filter(|_| !is_variant(&claim.plan)) else { return Ok(()) };
+        let parent = uuid::Uuid::parse_str(parent)?;
+        if self.queue.job(&claim.tenant, parent).await?.is_none() {
+            return Ok(());
+        }
+        if let Some(found) = self.queue.artefact(parent, folder::FIELD).await? {
+            let bytes = self.store.bytes(&found.object_key, &found.digest).await?;
+            tokio::fs::write(folder.earlier(), &bytes).await?;
+        }
+        Ok(())
     }
 
     /// Waits for the child, passing its progress on, and kills it when the job is cancelled, lost or handed back.
