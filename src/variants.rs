@@ -221,6 +221,35 @@ mod tests {
     }
 
     #[test]
+    fn several_plans_make_several_series_with_names_of_their_own() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let file = |name: &str, text: &str| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, text).unwrap();
+            path.to_string_lossy().into_owned()
+        };
+        let flat = file("flat.json", r#"{"variant": {"changes": [{"branch": "distal", "planar": true}]}}"#);
+        let plain = file("plain.json", "{}");
+        let of = |options: &[&str]| {
+            let line = ["vasculum", "vary", "job", "--out", "out"].iter().chain(options);
+            match Arguments::try_parse_from(line).unwrap().command {
+                Command::Vary(a) => planned(&a),
+                _ => Ok(Vec::new()),
+            }
+        };
+        let made = of(&["--plan", &flat, "--plan", &plain, "--angle", "graft=30,60"]).unwrap();
+        let names: Vec<&str> = made.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(
+            names,
+            ["flat_angle-graft-30", "flat_angle-graft-60", "plain_angle-graft-30", "plain_angle-graft-60"]
+        );
+        let changes = |k: usize| made[k].1.variant.as_ref().unwrap().changes.len();
+        assert_eq!((changes(0), changes(2)), (2, 1), "the plan's change goes before the option's");
+        assert_eq!(of(&["--plan", &flat]).unwrap()[0].0, "unchanged");
+        assert!(of(&["--plan", &flat, "--plan", &flat]).is_err(), "two variants of one name");
+    }
+
+    #[test]
     fn what_cannot_be_read_is_refused() {
         for options in [["--angle", "graft"], ["--angle", "graft=x"], ["--torsion", "graft=0.1"], ["--planar", "leg"]] {
             assert!(of(&options).is_err(), "{options:?}");
