@@ -139,6 +139,20 @@ pub struct SurfaceData<'a> {
     pub displacement_px: &'a [f64],
     /// Division of the wall into patches, where it was made.
     pub patches: Option<Patches<'a>>,
+    /// The wall as quadrilaterals.
+    pub quads: Quadrilaterals<'a>,
+}
+
+/// The wall as quadrilaterals of high order.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Quadrilaterals<'a> {
+    /// Not asked for.
+    #[default]
+    Unasked,
+    /// Asked for, and there is no such division: a warning says why.
+    Impossible,
+    /// Made.
+    Made(&'a surface::Quads),
 }
 
 /// Quality of the surface. Counts of vertices and triangles, area and volume of the mesh are taken from the mesh.

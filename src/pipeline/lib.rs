@@ -4,6 +4,8 @@
 mod facts;
 mod failure;
 mod folder;
+mod mesh_fault;
+mod patches;
 mod reconstruct;
 mod source;
 mod step;

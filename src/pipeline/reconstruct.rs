@@ -1,5 +1,7 @@
 //! From a scan to all artefacts.
 
+use crate::mesh_fault::MeshFault;
+use crate::patches::{self, Patched};
 use crate::step::{Steps, peak_memory_bytes};
 use crate::{Failure, Observer, folder};
 use crate::{facts, source};
@@ -33,6 +35,8 @@ pub(crate) struct Wall {
     pub(crate) extended: Option<surface::Extended>,
     /// Why there are none, where they were asked for.
     pub(crate) warnings: Vec<Warning>,
+    /// The field on whose zero level it lies, kept where patches are asked for.
+    pub(crate) field: Option<Sampled>,
 }
 
 /// The whole reconstruction: reads `inputs`, writes every artefact into the folder `out`, which appears whole or not at
@@ -69,14 +73,19 @@ fn reconstruct(
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
     let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
     let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
-    let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
+    let (graph, medial, patched) = steps.step("skeleton", |ctx| {
+        let (graph, medial) = medial_lines(&sampled, &f, &contours, &wall, &ctx.part(0.0, 0.8))?;
+        let patched = patches::patched(&wall, &contours, &graph, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((graph, medial, patched))
+    })?;
     let morphometry = steps.step("measure", |ctx| {
         let draws: Option<&dyn Draws> = if source.draws > 0 { Some(&ensemble) } else { None };
         morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &plan.morphometry(), ctx)
     })?;
 
     let told = source.warnings.into_iter();
-    let warnings: Vec<Warning> = told.chain(wall.warnings.clone()).chain(medial.warnings).collect();
+    let warnings: Vec<Warning> =
+        told.chain(wall.warnings.clone()).chain(medial.warnings).chain(patched.warnings.clone()).collect();
     let digest = source.input.digest.clone();
     let mut files = steps.step("write", |_| {
         let reconstruction = Reconstruction {
@@ -84,7 +93,7 @@ fn reconstruct(
             segmentation: source.segmentation,
             contours: &contours,
             implicit: facts::implicit(&fit),
-            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry),
+            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry, &patched),
             graph: &graph,
             morphometry: &morphometry,
             warnings: &warnings,
@@ -211,12 +220,12 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         let shell = shell_of(&field, f, contours, plan, &ctx.part(0.3, 0.9))?;
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            return Ok(measured(shell, &field, plan, &ctx.part(0.9, 1.0))?);
+            return Ok(measured(shell, field, plan, &ctx.part(0.9, 1.0))?);
         }
         limit = report.sigma_mm * RETREAT;
     }
     let shell = shell_of(&image.sampled, f, contours, plan, &ctx.part(0.0, 0.9))?;
-    Ok(measured(shell, &image.sampled, plan, &ctx.part(0.9, 1.0))?)
+    Ok(measured(shell, image.sampled, plan, &ctx.part(0.9, 1.0))?)
 }
 
 /// The capped and remeshed surface and how far it lies from the zero level of f as it was fitted.
@@ -255,15 +264,16 @@ fn shell_of(
     Ok(Shell { mesh, caps, displacement })
 }
 
-fn measured(shell: Shell, field: &Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
+fn measured(shell: Shell, field: Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
     let Shell { mesh, caps, displacement } = shell;
     let topology = surface::check(&mesh)?;
-    let quality = surface::quality(&mesh, field, ctx)?;
+    let quality = surface::quality(&mesh, &field, ctx)?;
     let ids: Vec<u32> = (0..caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
-    let (extended, warnings) = extended(&mesh, field, caps.len() as u32, plan, ctx)?;
+    let (extended, warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
     let beside = beside(&mesh, &caps);
-    Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings })
+    let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
+    Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings, field })
 }
 
 fn remeshed(
@@ -321,36 +331,6 @@ fn beside(mesh: &TriMesh, caps: &[surface::Cap]) -> Vec<[u32; 2]> {
     caps.iter().map(|c| [c.face_id, largest(c.face_id)]).filter(|[id, largest]| id != largest).collect()
 }
 
-/// The wall's stage calls two crates.
-#[derive(Debug, thiserror::Error)]
-enum MeshFault {
-    #[error(transparent)]
-    Surface(#[from] surface::Error),
-    #[error(transparent)]
-    Implicit(#[from] implicit::Error),
-}
-
-impl space::Faulty for MeshFault {
-    fn kind(&self) -> FaultKind {
-        match self {
-            Self::Surface(e) => e.kind(),
-            Self::Implicit(e) => e.kind(),
-        }
-    }
-    fn code(&self) -> &'static str {
-        match self {
-            Self::Surface(e) => e.code(),
-            Self::Implicit(e) => e.code(),
-        }
-    }
-    fn place(&self) -> space::Place {
-        match self {
-            Self::Surface(e) => e.place(),
-            Self::Implicit(e) => e.place(),
-        }
-    }
-}
-
 /// Medial lines of the unsmoothed image of f: the numbers come from the data, not from the smoothed wall.
 fn medial_lines(
     sampled: &Sampled,
@@ -369,13 +349,20 @@ fn medial_lines(
     skeleton::medial_graph(sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), ctx)
 }
 
-fn surface_data<'a>(wall: &'a Wall, pixel_mm: f64, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceData<'a> {
+fn surface_data<'a>(
+    wall: &'a Wall,
+    pixel_mm: f64,
+    graph: &MedialGraph,
+    morphometry: &Morphometry,
+    patched: &'a Patched,
+) -> SurfaceData<'a> {
     SurfaceData {
         mesh: &wall.mesh,
         quality: facts::surface(wall, pixel_mm, graph, morphometry),
         displacement_mm: &wall.displacement.mm,
         displacement_px: &wall.displacement.px,
         patches: Some(facts::patches(&wall.patches)),
+        quads: patched.facts(),
     }
 }
 

@@ -62,8 +62,10 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     let mut phantom = shell::command(binary);
     phantom.args(["phantom", "anastomosis", "--seed", "1", "--out"]).arg(&scan);
     shell::run(phantom)?;
+    let plan = work.join("plan.json");
+    fs::write(&plan, with_patches(&fs::read(scan.join("plan.json"))?)?)?;
     let mut run = shell::command(binary);
-    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json")).arg("--out").arg(&out);
+    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(&plan).arg("--out").arg(&out);
     shell::run(run)?;
     let surfaces = work.join("surfaces");
     fs::create_dir_all(&surfaces)?;
@@ -99,6 +101,13 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
         shell::run(judge)?;
     }
     Ok(())
+}
+
+/// The same plan, asking for patches too.
+fn with_patches(plan: &[u8]) -> Result<Vec<u8>> {
+    let mut plan: serde_json::Value = serde_json::from_slice(plan)?;
+    plan["outputs"] = serde_json::json!(["surface", "skeleton", "patches"]);
+    Ok(serde_json::to_vec(&plan)?)
 }
 
 fn scripts(folder: &str, extension: &str) -> Result<Vec<PathBuf>> {

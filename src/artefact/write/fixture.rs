@@ -3,8 +3,8 @@
 
 use crate::Reconstruction;
 use crate::reconstruction::{
-    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Range, SegmentationFacts, SlicePicture, SurfaceData,
-    SurfaceFacts,
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Quadrilaterals, Range, SegmentationFacts, SlicePicture,
+    SurfaceData, SurfaceFacts,
 };
 use imaging::{Axis, Contours};
 use morphometry::{
@@ -315,6 +315,7 @@ impl Fixture {
                 displacement_mm: &self.displacement,
                 displacement_px: &self.displacement,
                 patches: Some(Patches { patch_id: &self.patch_id, u: &self.uv, v: &self.uv }),
+                quads: Quadrilaterals::Unasked,
             },
             graph: &self.graph,
             morphometry: &self.morphometry,
