@@ -178,8 +178,21 @@ pub struct SurfaceFacts {
     pub displacement_px: Range,
     /// The same in mm.
     pub displacement_mm: Range,
+    /// Shapes, distances, and what the smoothing did.
+    pub report: QualityFacts,
     /// The plane ends.
     pub caps: Vec<CapFacts>,
+}
+
+/// What the quality report says beyond [`SurfaceFacts`].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct QualityFacts {
+    /// Shapes of triangles and distances from f = 0.
+    pub mesh: surface::Quality,
+    /// Hausdorff distance between the smoothed wall and the unsmoothed one, both ways, mm.
+    pub hausdorff_mm: f64,
+    /// Change of the enclosed volume by the smoothing, part of it (first order in the displacement).
+    pub volume_change: f64,
 }
 
 /// Extent of a signed quantity.

@@ -4,7 +4,7 @@ use crate::reconstruct::Wall;
 use crate::step::StageTime;
 use artefact::read::InputReport;
 use artefact::reconstruction::{
-    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Range, SegmentationFacts, SurfaceFacts,
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, QualityFacts, Range, SegmentationFacts, SurfaceFacts,
 };
 use imaging::{Axis, Contours};
 use morphometry::{Morphometry, Role};
@@ -73,8 +73,24 @@ pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphomet
         volume_mm3: wall.mesh.volume(),
         displacement_px: Range { min: d.min_mm / pixel_mm, max: d.max_mm / pixel_mm, rms: d.rms_mm / pixel_mm },
         displacement_mm: Range { min: d.min_mm, max: d.max_mm, rms: d.rms_mm },
+        report: QualityFacts {
+            mesh: wall.quality.clone(),
+            hausdorff_mm: wall.hausdorff_mm,
+            volume_change: volume_change(wall),
+        },
         caps: caps(wall, graph, morphometry),
     }
+}
+
+/// Volume between the wall and the unsmoothed one, to first order in their distance, as part of the enclosed volume.
+fn volume_change(wall: &Wall) -> f64 {
+    let mesh = &wall.mesh;
+    let slab = |t: usize| {
+        let moved = mesh.triangles[t].iter().fold(0.0, |s, &v| s + wall.displacement.mm[v as usize] / 3.0);
+        0.5 * mesh.area_vector(t).length() * moved
+    };
+    let walls = (0..mesh.triangles.len()).filter(|&t| mesh.face_id[t] == surface::WALL);
+    walls.fold(0.0, |s, t| s + slab(t)) / mesh.volume()
 }
 
 /// A cap is named by the role of the branch that ends there; by the branch's number where several caps have that role,

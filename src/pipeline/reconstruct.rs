@@ -30,6 +30,8 @@ pub(crate) struct Wall {
     pub(crate) topology: Topology,
     pub(crate) quality: Quality,
     pub(crate) displacement: Displacement,
+    /// Hausdorff distance to the unsmoothed wall, both ways, mm.
+    pub(crate) hausdorff_mm: f64,
     pub(crate) patches: surface::Patches,
     /// The wall with flow extensions, where they were asked for and have room.
     pub(crate) extended: Option<surface::Extended>,
@@ -220,12 +222,16 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         let shell = shell_of(&field, f, contours, plan, &ctx.part(0.3, 0.9))?;
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            return Ok(measured(shell, field, plan, &ctx.part(0.9, 1.0))?);
+            let back = TriMesh { vertices: image.wall, ..TriMesh::default() };
+            let back = surface::displacement(&back, &field, contours.pixel_mm, ctx)?;
+            let moved = moved.max(back.max_mm.max(-back.min_mm));
+            return Ok(measured(shell, field, moved, plan, &ctx.part(0.9, 1.0))?);
         }
         limit = report.sigma_mm * RETREAT;
     }
     let shell = shell_of(&image.sampled, f, contours, plan, &ctx.part(0.0, 0.9))?;
-    Ok(measured(shell, image.sampled, plan, &ctx.part(0.9, 1.0))?)
+    let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
+    Ok(measured(shell, image.sampled, moved, plan, &ctx.part(0.9, 1.0))?)
 }
 
 /// The capped and remeshed surface and how far it lies from the zero level of f as it was fitted.
@@ -264,7 +270,7 @@ fn shell_of(
     Ok(Shell { mesh, caps, displacement })
 }
 
-fn measured(shell: Shell, field: Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
+fn measured(shell: Shell, field: Sampled, hausdorff_mm: f64, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
     let Shell { mesh, caps, displacement } = shell;
     let topology = surface::check(&mesh)?;
     let quality = surface::quality(&mesh, &field, ctx)?;
@@ -273,7 +279,7 @@ fn measured(shell: Shell, field: Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall
     let (extended, warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
     let beside = beside(&mesh, &caps);
     let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
-    Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings, field })
+    Ok(Wall { mesh, caps, beside, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
 }
 
 fn remeshed(

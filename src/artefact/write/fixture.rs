@@ -3,8 +3,8 @@
 
 use crate::Reconstruction;
 use crate::reconstruction::{
-    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Quadrilaterals, Range, SegmentationFacts, SlicePicture,
-    SurfaceData, SurfaceFacts,
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Quadrilaterals, QualityFacts, Range, SegmentationFacts,
+    SlicePicture, SurfaceData, SurfaceFacts,
 };
 use imaging::{Axis, Contours};
 use morphometry::{
@@ -310,6 +310,7 @@ impl Fixture {
                     volume_mm3: self.area_and_volume[1],
                     displacement_px: range(2.0),
                     displacement_mm: range(1.0),
+                    report: QualityFacts { hausdorff_mm: 0.2, volume_change: -0.004, ..QualityFacts::default() },
                     caps: (0..3).map(cap).collect(),
                 },
                 displacement_mm: &self.displacement,
