@@ -211,8 +211,10 @@ pub struct Range {
 pub struct CapFacts {
     /// Face id in the mesh, 1 or more.
     pub face_id: u32,
-    /// Name of the boundary, such as `outlet_distal`.
+    /// Name by the branch that ends there, such as `end_distal`.
     pub name: String,
+    /// Name for flow solvers: `inlet`, or `inlet_1` and so on where there are several, and `outlet_1` and so on.
+    pub boundary: String,
     /// Centre of area.
     pub centroid: P3,
     /// Unit normal out of the lumen.

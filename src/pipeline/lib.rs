@@ -1,6 +1,7 @@
 //! The paper as one function: [`run`] reads like its section 3. Knows no HTTP, user or queue; the command line and the
 //! service's worker both call it.
 
+mod ends;
 mod facts;
 mod failure;
 mod folder;

@@ -1,5 +1,6 @@
 //! Faults of stages that call more than one crate.
 
+use crate::ends::EndFault;
 use space::FaultKind;
 
 /// The wall's and the medial lines' stages call two crates each.
@@ -11,6 +12,8 @@ pub(crate) enum MeshFault {
     Implicit(#[from] implicit::Error),
     #[error(transparent)]
     Skeleton(#[from] skeleton::Error),
+    #[error(transparent)]
+    End(#[from] EndFault),
 }
 
 impl space::Faulty for MeshFault {
@@ -19,6 +22,7 @@ impl space::Faulty for MeshFault {
             Self::Surface(e) => e.kind(),
             Self::Implicit(e) => e.kind(),
             Self::Skeleton(e) => e.kind(),
+            Self::End(e) => e.kind(),
         }
     }
     fn code(&self) -> &'static str {
@@ -26,6 +30,7 @@ impl space::Faulty for MeshFault {
             Self::Surface(e) => e.code(),
             Self::Implicit(e) => e.code(),
             Self::Skeleton(e) => e.code(),
+            Self::End(e) => e.code(),
         }
     }
     fn place(&self) -> space::Place {
@@ -33,6 +38,7 @@ impl space::Faulty for MeshFault {
             Self::Surface(e) => e.place(),
             Self::Implicit(e) => e.place(),
             Self::Skeleton(e) => e.place(),
+            Self::End(e) => e.place(),
         }
     }
 }

@@ -1,5 +1,6 @@
 //! From a scan to all artefacts.
 
+use crate::ends::{self, Ends};
 use crate::mesh_fault::MeshFault;
 use crate::patches::{self, Patched};
 use crate::step::{Steps, peak_memory_bytes};
@@ -69,14 +70,22 @@ fn reconstruct(
         None => source::scanned(inputs, plan, &mut steps)?,
         Some(variant) => source::changed(inputs, plan, variant, &mut steps)?,
     };
-    let (contours, plan) = (source.contours, &source.plan);
+    let (mut contours, plan) = (source.contours, &source.plan);
     let (f, fit, ensemble) =
         steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &fit_settings(), source.draws, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
-    let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
-    let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
+    let (sampled, image, ends) = steps.step("smooth", |ctx| {
+        let (sampled, image) = smoothed(&f, &raw, &contours, plan, &ctx.part(0.0, 0.8))?;
+        let seeds = within(&contours, f.inner());
+        let ends = ends::ends(&plan.ends.cut_mm, &sampled, &contours, &seeds, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((sampled, image.kept(&ends), ends))
+    })?;
+    contours.cuts.extend(&ends.cuts);
+    let contours = contours;
+    let seeds = Seeds::new(&f, &contours, &ends);
+    let wall = steps.step("mesh", |ctx| wall(&f, &seeds, image, &contours, plan, ctx))?;
     let (graph, medial, patched) = steps.step("skeleton", |ctx| {
-        let (graph, medial) = medial_lines(&sampled, &f, &contours, &wall, &ctx.part(0.0, 0.8))?;
+        let (graph, medial) = medial_lines(&sampled, &seeds.inner, &contours, &wall, &ctx.part(0.0, 0.8))?;
         let patched = patches::patched(&wall, &contours, &graph, &ctx.part(0.8, 1.0))?;
         Ok::<_, MeshFault>((graph, medial, patched))
     })?;
@@ -154,11 +163,6 @@ fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
     if plan.outputs.iter().any(|o| o == "volume") {
         return refuse("outputs", "this version makes no volume mesh: leave `volume` out of the plan's outputs");
     }
-    if !plan.ends.cut_mm.is_empty() {
-        let message = "this version cuts where the data end and nowhere else: leave ends.cut_mm empty, \
-                       and leave slices out (segmentation.exclude_slices) to end a vessel sooner";
-        return refuse("ends.cut_mm", message);
-    }
     Ok(())
 }
 
@@ -199,6 +203,27 @@ struct Image {
     sampled: Sampled,
 }
 
+impl Image {
+    /// Only wall that is kept tells how far it may be smoothed.
+    fn kept(self, ends: &Ends) -> Self {
+        let wall = self.wall.into_iter().filter(|&p| ends.keeps(p)).collect();
+        Self { wall, ..self }
+    }
+}
+
+/// Points from which wall and lumen are grown: those of the fit on what is kept.
+struct Seeds {
+    wall: Vec<P3>,
+    inner: Vec<P3>,
+}
+
+impl Seeds {
+    fn new(f: &Variational, contours: &Contours, ends: &Ends) -> Self {
+        let kept = |points: &[P3]| points.iter().copied().filter(|&p| ends.keeps(p)).collect::<Vec<_>>();
+        Self { wall: kept(f.wall()), inner: kept(&within(contours, f.inner())) }
+    }
+}
+
 /// Wall points on the inner side of every cut plane: only there is the wall known.
 fn within(contours: &Contours, points: &[P3]) -> Vec<P3> {
     let inside = |p: &&P3| contours.cuts.iter().all(|c| !c.excludes(**p));
@@ -211,7 +236,14 @@ const ATTEMPTS: usize = 6;
 const RETREAT: f64 = 0.75;
 
 /// The finished wall: smoothed, cut at the data's ends, capped, remeshed, measured.
-fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+fn wall(
+    f: &Variational,
+    seeds: &Seeds,
+    image: Image,
+    contours: &Contours,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<Wall, MeshFault> {
     let mut limit = if image.smoothing.max_displacement_px > 0.0 { f64::INFINITY } else { 0.0 };
     for _ in 0..ATTEMPTS {
         let (field, report) = if limit > 0.0 {
@@ -219,7 +251,7 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         } else {
             break;
         };
-        let shell = shell_of(&field, f, contours, plan, &ctx.part(0.3, 0.9))?;
+        let shell = shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9))?;
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
             let back = TriMesh { vertices: image.wall, ..TriMesh::default() };
@@ -229,7 +261,7 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         }
         limit = report.sigma_mm * RETREAT;
     }
-    let shell = shell_of(&image.sampled, f, contours, plan, &ctx.part(0.0, 0.9))?;
+    let shell = shell_of(&image.sampled, (f, seeds), contours, plan, &ctx.part(0.0, 0.9))?;
     let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
     Ok(measured(shell, image.sampled, moved, plan, &ctx.part(0.9, 1.0))?)
 }
@@ -247,7 +279,7 @@ const HALVINGS: i32 = 2;
 
 fn shell_of(
     field: &Sampled,
-    f: &Variational,
+    (f, seeds): (&Variational, &Seeds),
     contours: &Contours,
     plan: &Plan,
     ctx: &Ctx,
@@ -255,7 +287,7 @@ fn shell_of(
     let by = |halvings: i32, ctx: &Ctx| {
         let cell_mm = contours.pixel_mm * 0.5_f64.powi(halvings);
         let cell = PolygoniseSettings { cell_mm, ..PolygoniseSettings::default() };
-        let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+        let (rough, _) = surface::polygonise(&bounded(field, contours), &seeds.wall, &cell, &ctx.part(0.0, 0.1))?;
         let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
         Ok((remeshed(&cut, field, contours, plan, &ctx.part(0.2, 1.0))?, report.caps))
     };
@@ -340,7 +372,7 @@ fn beside(mesh: &TriMesh, caps: &[surface::Cap]) -> Vec<[u32; 2]> {
 /// Medial lines of the unsmoothed image of f: the numbers come from the data, not from the smoothed wall.
 fn medial_lines(
     sampled: &Sampled,
-    f: &Variational,
+    seeds: &[P3],
     contours: &Contours,
     wall: &Wall,
     ctx: &Ctx,
@@ -351,8 +383,7 @@ fn medial_lines(
         .filter(|c| wall.beside.iter().all(|&[small, _]| small != c.face_id))
         .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
         .collect();
-    let seeds = within(contours, f.inner());
-    skeleton::medial_graph(sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), ctx)
+    skeleton::medial_graph(sampled, &contours.cuts, &caps, seeds, &skeleton::Settings::default(), ctx)
 }
 
 fn surface_data<'a>(

@@ -268,6 +268,7 @@ impl Fixture {
         let cap = |k: usize| CapFacts {
             face_id: k as u32 + 1,
             name: format!("end_{}", ARMS[k].2.name()),
+            boundary: ["inlet_1", "inlet_2", "outlet_1"][k].to_owned(),
             centroid: CENTRE + V3::from(ARMS[k].0),
             normal: V3::from(ARMS[k].0).normalised().unwrap(),
             area_mm2: 20.0,

@@ -1,7 +1,7 @@
 //! result.json and skeleton.json: the numbers, under the names and in the order of contract.md.
 //!
 //! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
-//! `displacement_mm`, `patches`, `quads` (where asked for), `quality` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
+//! `displacement_mm`, `patches`, `quads` (where asked for), `quality` and `caps` (with `boundary`); `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
 //! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`;
 //! `variant` where the result is a re-synthesis.
 //! What could not be had is null.
@@ -149,6 +149,7 @@ fn cap(c: &CapFacts) -> Json {
     Json::Object(vec![
         ("face_id", c.face_id.into()),
         ("name", (&c.name).into()),
+        ("boundary", (&c.boundary).into()),
         ("centroid", c.centroid.into()),
         ("normal", c.normal.into()),
         ("area_mm2", c.area_mm2.into()),

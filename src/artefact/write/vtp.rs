@@ -106,6 +106,8 @@ pub(crate) struct PolyData {
     pub points: Vec<P3>,
     pub lines: Vec<Vec<usize>>,
     pub polygons: Vec<[u32; 3]>,
+    /// Named lists of words that belong to the whole: the k-th word is that of id k.
+    pub words: Vec<(&'static str, Vec<String>)>,
     pub point_arrays: Vec<Array>,
     pub cell_arrays: Vec<Array>,
 }
@@ -135,6 +137,9 @@ impl PolyData {
             "<VTKFile type=\"PolyData\" version=\"1.0\" byte_order=\"LittleEndian\" header_type=\"UInt64\">\n",
         );
         xml.push_str("<!-- frame DICOM LPS, lengths in mm -->\n<PolyData>\n");
+        for (name, words) in &self.words {
+            xml.push_str(&field_words(name, words));
+        }
         xml.push_str(&format!(
             "<Piece NumberOfPoints=\"{}\" NumberOfVerts=\"0\" NumberOfLines=\"{}\" NumberOfStrips=\"0\" NumberOfPolys=\"{}\">\n",
             self.points.len(),
@@ -152,6 +157,16 @@ impl PolyData {
         out.extend_from_slice(b"\n</AppendedData>\n</VTKFile>\n");
         Ok(out)
     }
+}
+
+/// Words as VTK's XML has them: the codes of their letters, each word ended by a 0.
+fn field_words(name: &str, words: &[String]) -> String {
+    let codes: String = words.iter().flat_map(|w| w.bytes().chain([0])).map(|b| format!("{b} ")).collect();
+    let n = words.len();
+    format!(
+        "<FieldData>\n<Array type=\"String\" Name=\"{name}\" NumberOfTuples=\"{n}\" format=\"ascii\">\n{}\n</Array>\n</FieldData>\n",
+        codes.trim_end()
+    )
 }
 
 /// Connectivity and offsets of some cells.
