@@ -34,6 +34,8 @@ const PYTHON_PACKAGES: &[&str] = &[
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
+/// Programs that fill our surfaces with tetrahedra; judges only, never linked.
+const SOLVER_PACKAGES: &[&str] = &["numpy", "gmsh==4.15.2", "tetgen==0.8.4"];
 const NODE_PACKAGES: &[&str] =
     &["gltf-validator@2.0.0-dev.3.10", "playwright-core@1.65.1", "tus-js-client@4.3.1", "axe-core@4.14.1"];
 
@@ -169,6 +171,22 @@ pub(crate) fn thinning_peers() -> Result<PathBuf> {
         apt("Python with venv (programs to measure against)", &["python3", "python3-venv"])?;
     }
     environment("venv-thinning", THINNING_PACKAGES)
+}
+
+/// Python with programs that fill volumes; the path of its interpreter.
+pub(crate) fn solvers() -> Result<PathBuf> {
+    if !shell::has("python3") || !python_has_venv() {
+        apt("Python with venv (programs that judge our files)", &["python3", "python3-venv"])?;
+    }
+    let interpreter = environment("venv-solvers", SOLVER_PACKAGES)?;
+    let mut load = shell::command(&interpreter);
+    load.args(["-c", "import gmsh, tetgen"]);
+    if !shell::succeeds(load) {
+        let libraries =
+            ["libglu1-mesa", "libgl1", "libopengl0", "libxcursor1", "libxfixes3", "libxft2", "libxinerama1"];
+        apt("libraries that Gmsh is linked with", &[&libraries[..], &["libgomp1"]].concat())?;
+    }
+    Ok(interpreter)
 }
 
 /// A virtual environment with these packages; the path of its interpreter.
