@@ -7,6 +7,8 @@
 
 mod cap;
 mod cut;
+#[cfg(test)]
+mod dent;
 mod distance;
 mod ends;
 mod error;
