@@ -199,9 +199,18 @@ fn main() {
         -worst(&|l| -l.quality.min_angle_deg),
         worst(&|l| l.quality.max_angle_deg),
     );
+    patched(&lines);
+    assert!(missed == 0, "{missed} meshes miss a bar");
+}
+
+/// All walls as quadrilaterals in one line.
+fn patched(lines: &[Line]) {
     let quads: Vec<&Quads> = lines.iter().filter_map(|l| l.quads.as_ref()?.0.as_ref().ok()).collect();
     let count = |f: &dyn Fn(&Quads) -> usize| quads.iter().map(|q| f(q)).sum::<usize>();
     let least = |f: &dyn Fn(&Quads) -> f64| quads.iter().map(|q| f(q)).fold(f64::INFINITY, f64::min);
+    if quads.is_empty() {
+        return;
+    }
     println!(
         "{} walls as quadrilaterals: {} patches, {} poles, at most {:.4} mm, least sine {:.2}, least Jacobian {:.3} of the area",
         quads.len(),
@@ -211,5 +220,4 @@ fn main() {
         least(&|q| q.least_sine),
         least(&|q| q.least_jacobian),
     );
-    assert!(missed == 0, "{missed} meshes miss a bar");
 }
