@@ -8,7 +8,8 @@
 //! on through separating curves to the next ends. Caps are left out: rims lie in their planes, shared edge by edge.
 //!
 //! Limits: a branch that ends blind, and a loop for which no section is given, have no such division and say so. Where
-//! three separating curves meet (two poles per bifurcation) six patches do, with corners of 60 degrees.
+//! three separating curves meet (two poles per bifurcation) six patches do, with corners of 60 degrees. A rim that two caps
+//! share (a vessel that leaves across an edge of the volume) is followed on f alone, and its corner is cut.
 //! Rejected: nodes at equal steps of (u, v) itself. A conformal map is singular at a pole (x ~ w^(2/3)).
 
 mod arcs;
