@@ -36,7 +36,8 @@ pub struct Plan {
     pub ends: Ends,
     /// Angles.
     pub morphometry: Morphometry,
-    /// What to make: `surface`, `skeleton`, `volume`. Empty or absent: surface and skeleton.
+    /// What to make: `surface`, `skeleton`, `volume`, and beyond them `graphml`, `swc`, `patches`. Empty or absent: surface
+    /// and skeleton.
     pub outputs: Vec<String>,
     /// A re-synthesis: the input is then the sections.json of a finished reconstruction.
     #[serde(skip_serializing_if = "Option::is_none")]

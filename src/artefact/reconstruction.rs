@@ -139,6 +139,20 @@ pub struct SurfaceData<'a> {
     pub displacement_px: &'a [f64],
     /// Division of the wall into patches, where it was made.
     pub patches: Option<Patches<'a>>,
+    /// The wall as quadrilaterals.
+    pub quads: Quadrilaterals<'a>,
+}
+
+/// The wall as quadrilaterals of high order.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Quadrilaterals<'a> {
+    /// Not asked for.
+    #[default]
+    Unasked,
+    /// Asked for, and there is no such division: a warning says why.
+    Impossible,
+    /// Made.
+    Made(&'a surface::Quads),
 }
 
 /// Quality of the surface. Counts of vertices and triangles, area and volume of the mesh are taken from the mesh.
@@ -164,8 +178,21 @@ pub struct SurfaceFacts {
     pub displacement_px: Range,
     /// The same in mm.
     pub displacement_mm: Range,
+    /// Shapes, distances, and what the smoothing did.
+    pub report: QualityFacts,
     /// The plane ends.
     pub caps: Vec<CapFacts>,
+}
+
+/// What the quality report says beyond [`SurfaceFacts`].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct QualityFacts {
+    /// Shapes of triangles and distances from f = 0.
+    pub mesh: surface::Quality,
+    /// Hausdorff distance between the smoothed wall and the unsmoothed one, both ways, mm.
+    pub hausdorff_mm: f64,
+    /// Change of the enclosed volume by the smoothing, part of it (first order in the displacement).
+    pub volume_change: f64,
 }
 
 /// Extent of a signed quantity.
@@ -184,8 +211,10 @@ pub struct Range {
 pub struct CapFacts {
     /// Face id in the mesh, 1 or more.
     pub face_id: u32,
-    /// Name of the boundary, such as `outlet_distal`.
+    /// Name by the branch that ends there, such as `end_distal`.
     pub name: String,
+    /// Name for flow solvers: `inlet`, or `inlet_1` and so on where there are several, and `outlet_1` and so on.
+    pub boundary: String,
     /// Centre of area.
     pub centroid: P3,
     /// Unit normal out of the lumen.

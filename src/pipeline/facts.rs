@@ -4,7 +4,7 @@ use crate::reconstruct::Wall;
 use crate::step::StageTime;
 use artefact::read::InputReport;
 use artefact::reconstruction::{
-    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Range, SegmentationFacts, SurfaceFacts,
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, QualityFacts, Range, SegmentationFacts, SurfaceFacts,
 };
 use imaging::{Axis, Contours};
 use morphometry::{Morphometry, Role};
@@ -73,8 +73,24 @@ pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphomet
         volume_mm3: wall.mesh.volume(),
         displacement_px: Range { min: d.min_mm / pixel_mm, max: d.max_mm / pixel_mm, rms: d.rms_mm / pixel_mm },
         displacement_mm: Range { min: d.min_mm, max: d.max_mm, rms: d.rms_mm },
+        report: QualityFacts {
+            mesh: wall.quality.clone(),
+            hausdorff_mm: wall.hausdorff_mm,
+            volume_change: volume_change(wall),
+        },
         caps: caps(wall, graph, morphometry),
     }
+}
+
+/// Volume between the wall and the unsmoothed one, to first order in their distance, as part of the enclosed volume.
+fn volume_change(wall: &Wall) -> f64 {
+    let mesh = &wall.mesh;
+    let slab = |t: usize| {
+        let moved = mesh.triangles[t].iter().fold(0.0, |s, &v| s + wall.displacement.mm[v as usize] / 3.0);
+        0.5 * mesh.area_vector(t).length() * moved
+    };
+    let walls = (0..mesh.triangles.len()).filter(|&t| mesh.face_id[t] == surface::WALL);
+    walls.fold(0.0, |s, t| s + slab(t)) / mesh.volume()
 }
 
 /// A cap is named by the role of the branch that ends there; by the branch's number where several caps have that role,
@@ -93,14 +109,52 @@ fn caps(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapF
         Some((_, id)) => format!("end_branch_{id}_cap_{}", wall.caps[i].face_id),
         None => format!("end_{}", wall.caps[i].face_id),
     };
+    let boundary = boundaries(&wall.caps, &branches);
     let fact = |(i, c): (usize, &surface::Cap)| CapFacts {
         face_id: c.face_id,
         name: name(i),
+        boundary: boundary[i].clone(),
         centroid: c.centroid,
         normal: c.plane.outward,
         area_mm2: c.area_mm2,
     };
     wall.caps.iter().enumerate().map(fact).collect()
+}
+
+/// Caps whose area is within this part of the largest count as equally wide: noise must not swap their names.
+const AS_WIDE: f64 = 0.9;
+
+/// Blood comes in by the graft and the proximal vessel, and leaves by all others; without those roles it comes in by the
+/// widest end (of equally wide ones the first by place). Numbers go by role, then by face id, which goes by place.
+fn boundaries(caps: &[surface::Cap], branches: &[Option<(Role, usize)>]) -> Vec<String> {
+    let rank = |i: usize| match branches[i].map(|b| b.0) {
+        Some(Role::Graft) => 0,
+        Some(Role::Proximal) => 1,
+        Some(Role::Distal) => 2,
+        Some(Role::HostA) => 3,
+        Some(Role::HostB) => 4,
+        Some(Role::Other) => 5,
+        None => 6,
+    };
+    let widest = caps.iter().map(|c| c.area_mm2).fold(0.0, f64::max);
+    let entrance = caps.iter().position(|c| c.area_mm2 >= AS_WIDE * widest);
+    let known = (0..caps.len()).any(|i| rank(i) <= 1);
+    let enters = |i: usize| if known { rank(i) <= 1 } else { Some(i) == entrance };
+    let mut order: Vec<usize> = (0..caps.len()).collect();
+    order.sort_by_key(|&i| (rank(i), caps[i].face_id));
+    let inlets = order.iter().filter(|&&i| enters(i)).count();
+    let mut names = vec![String::new(); caps.len()];
+    let (mut into, mut out) = (0, 0);
+    for i in order {
+        names[i] = if enters(i) {
+            into += 1;
+            if inlets == 1 { "inlet".to_owned() } else { format!("inlet_{into}") }
+        } else {
+            out += 1;
+            format!("outlet_{out}")
+        };
+    }
+    names
 }
 
 pub(crate) fn patches(p: &surface::Patches) -> Patches<'_> {
@@ -130,4 +184,33 @@ pub(crate) fn now_utc() -> String {
     let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
     let year = era * 400 + year_of_era + u64::from(month <= 2);
     format!("{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", rest / 3600, rest / 60 % 60, rest % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use imaging::CutPlane;
+    use space::{P3, V3};
+
+    fn names(caps: &[(f64, Option<Role>)]) -> Vec<String> {
+        let cap = |(k, c): (usize, &(f64, Option<Role>))| surface::Cap {
+            face_id: k as u32 + 1,
+            plane: CutPlane::new(P3::ORIGIN, V3::Z),
+            cut: k,
+            centroid: P3::ORIGIN,
+            area_mm2: c.0,
+            perimeter_mm: 1.0,
+        };
+        let of: Vec<surface::Cap> = caps.iter().enumerate().map(cap).collect();
+        boundaries(&of, &caps.iter().enumerate().map(|(k, c)| c.1.map(|r| (r, k))).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn boundaries_are_named_by_role_and_not_by_a_hair_of_area() {
+        let known = [(20.0, Some(Role::Distal)), (28.0, Some(Role::Proximal)), (19.0, Some(Role::Graft))];
+        assert_eq!(names(&known), ["outlet_1", "inlet_2", "inlet_1"]);
+        assert_eq!(names(&[(28.0, Some(Role::HostA)), (28.1, Some(Role::HostB))]), ["inlet", "outlet_1"]);
+        let tree = [(9.0, Some(Role::Other)), (80.0, Some(Role::Other)), (9.0, None)];
+        assert_eq!(names(&tree), ["outlet_1", "inlet", "outlet_2"]);
+    }
 }

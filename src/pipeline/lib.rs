@@ -1,10 +1,13 @@
 //! The paper as one function: [`run`] reads like its section 3. Knows no HTTP, user or queue; the command line and the
 //! service's worker both call it.
 
+mod ends;
 mod facts;
 mod failure;
 mod folder;
 mod memory;
+mod mesh_fault;
+mod patches;
 mod reconstruct;
 mod source;
 mod step;

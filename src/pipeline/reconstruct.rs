@@ -1,6 +1,9 @@
 //! From a scan to all artefacts.
 
+use crate::ends::{self, Ends};
 use crate::memory::Memory;
+use crate::mesh_fault::MeshFault;
+use crate::patches::{self, Patched};
 use crate::step::{Steps, peak_memory_bytes};
 use crate::{Failure, Observer, folder};
 use crate::{facts, source};
@@ -30,11 +33,15 @@ pub(crate) struct Wall {
     pub(crate) topology: Topology,
     pub(crate) quality: Quality,
     pub(crate) displacement: Displacement,
+    /// Hausdorff distance to the unsmoothed wall, both ways, mm.
+    pub(crate) hausdorff_mm: f64,
     pub(crate) patches: surface::Patches,
     /// The wall with flow extensions, where they were asked for and have room.
     pub(crate) extended: Option<surface::Extended>,
     /// Why there are none, where they were asked for.
     pub(crate) warnings: Vec<Warning>,
+    /// The field on whose zero level it lies, kept where patches are asked for.
+    pub(crate) field: Option<Sampled>,
 }
 
 /// The whole reconstruction: reads `inputs`, writes every artefact into the folder `out`, which appears whole or not at
@@ -83,20 +90,33 @@ fn reconstruct(
         None => source::scanned(inputs, plan, &mut steps)?,
         Some(variant) => source::changed(inputs, plan, variant, &mut steps)?,
     };
-    let (contours, plan) = (source.contours, &source.plan);
+    let (mut contours, plan) = (source.contours, &source.plan);
     let (f, fit, ensemble) =
         steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &fit_settings(), source.draws, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
-    let (sampled, image) = steps.step("smooth", |ctx| smoothed(&f, &raw, &contours, plan, ctx))?;
-    let wall = steps.step("mesh", |ctx| wall(&f, image, &contours, plan, ctx))?;
-    let (graph, medial) = steps.step("skeleton", |ctx| medial_lines(&sampled, &f, &contours, &wall, ctx))?;
+    let (sampled, image, ends) = steps.step("smooth", |ctx| {
+        let (sampled, image) = smoothed(&f, &raw, &contours, plan, &ctx.part(0.0, 0.8))?;
+        let seeds = within(&contours, f.inner());
+        let ends = ends::ends(&plan.ends.cut_mm, &sampled, &contours, &seeds, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((sampled, image.kept(&ends), ends))
+    })?;
+    contours.cuts.extend(&ends.cuts);
+    let contours = contours;
+    let seeds = Seeds::new(&f, &contours, &ends);
+    let wall = steps.step("mesh", |ctx| wall(&f, &seeds, image, &contours, plan, ctx))?;
+    let (graph, medial, patched) = steps.step("skeleton", |ctx| {
+        let (graph, medial) = medial_lines(&sampled, &seeds.inner, &contours, &wall, &ctx.part(0.0, 0.8))?;
+        let patched = patches::patched(&wall, &contours, &graph, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((graph, medial, patched))
+    })?;
     let morphometry = steps.step("measure", |ctx| {
         let draws: Option<&dyn Draws> = if source.draws > 0 { Some(&ensemble) } else { None };
         morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &plan.morphometry(), ctx)
     })?;
 
     let told = source.warnings.into_iter();
-    let warnings: Vec<Warning> = told.chain(wall.warnings.clone()).chain(medial.warnings).collect();
+    let warnings: Vec<Warning> =
+        told.chain(wall.warnings.clone()).chain(medial.warnings).chain(patched.warnings.clone()).collect();
     let digest = source.input.digest.clone();
     let mut files = steps.step("write", |_| {
         let reconstruction = Reconstruction {
@@ -104,7 +124,7 @@ fn reconstruct(
             segmentation: source.segmentation,
             contours: &contours,
             implicit: facts::implicit(&fit),
-            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry),
+            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry, &patched),
             graph: &graph,
             morphometry: &morphometry,
             warnings: &warnings,
@@ -165,11 +185,6 @@ fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
     if plan.outputs.iter().any(|o| o == "volume") {
         return refuse("outputs", "this version makes no volume mesh: leave `volume` out of the plan's outputs");
     }
-    if !plan.ends.cut_mm.is_empty() {
-        let message = "this version cuts where the data end and nowhere else: leave ends.cut_mm empty, \
-                       and leave slices out (segmentation.exclude_slices) to end a vessel sooner";
-        return refuse("ends.cut_mm", message);
-    }
     Ok(())
 }
 
@@ -210,6 +225,27 @@ struct Image {
     sampled: Sampled,
 }
 
+impl Image {
+    /// Only wall that is kept tells how far it may be smoothed.
+    fn kept(self, ends: &Ends) -> Self {
+        let wall = self.wall.into_iter().filter(|&p| ends.keeps(p)).collect();
+        Self { wall, ..self }
+    }
+}
+
+/// Points from which wall and lumen are grown: those of the fit on what is kept.
+struct Seeds {
+    wall: Vec<P3>,
+    inner: Vec<P3>,
+}
+
+impl Seeds {
+    fn new(f: &Variational, contours: &Contours, ends: &Ends) -> Self {
+        let kept = |points: &[P3]| points.iter().copied().filter(|&p| ends.keeps(p)).collect::<Vec<_>>();
+        Self { wall: kept(f.wall()), inner: kept(&within(contours, f.inner())) }
+    }
+}
+
 /// Wall points on the inner side of every cut plane: only there is the wall known.
 fn within(contours: &Contours, points: &[P3]) -> Vec<P3> {
     let inside = |p: &&P3| contours.cuts.iter().all(|c| !c.excludes(**p));
@@ -222,7 +258,14 @@ const ATTEMPTS: usize = 6;
 const RETREAT: f64 = 0.75;
 
 /// The finished wall: smoothed, cut at the data's ends, capped, remeshed, measured.
-fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+fn wall(
+    f: &Variational,
+    seeds: &Seeds,
+    image: Image,
+    contours: &Contours,
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<Wall, MeshFault> {
     let mut limit = if image.smoothing.max_displacement_px > 0.0 { f64::INFINITY } else { 0.0 };
     for _ in 0..ATTEMPTS {
         let (field, report) = if limit > 0.0 {
@@ -230,15 +273,19 @@ fn wall(f: &Variational, image: Image, contours: &Contours, plan: &Plan, ctx: &C
         } else {
             break;
         };
-        let shell = shell_of(&field, f, contours, plan, &ctx.part(0.3, 0.9))?;
+        let shell = shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9))?;
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            return Ok(measured(shell, &field, plan, &ctx.part(0.9, 1.0))?);
+            let back = TriMesh { vertices: image.wall, ..TriMesh::default() };
+            let back = surface::displacement(&back, &field, contours.pixel_mm, ctx)?;
+            let moved = moved.max(back.max_mm.max(-back.min_mm));
+            return Ok(measured(shell, field, moved, plan, &ctx.part(0.9, 1.0))?);
         }
         limit = report.sigma_mm * RETREAT;
     }
-    let shell = shell_of(&image.sampled, f, contours, plan, &ctx.part(0.0, 0.9))?;
-    Ok(measured(shell, &image.sampled, plan, &ctx.part(0.9, 1.0))?)
+    let shell = shell_of(&image.sampled, (f, seeds), contours, plan, &ctx.part(0.0, 0.9))?;
+    let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
+    Ok(measured(shell, image.sampled, moved, plan, &ctx.part(0.9, 1.0))?)
 }
 
 /// The capped and remeshed surface and how far it lies from the zero level of f as it was fitted.
@@ -254,7 +301,7 @@ const HALVINGS: i32 = 2;
 
 fn shell_of(
     field: &Sampled,
-    f: &Variational,
+    (f, seeds): (&Variational, &Seeds),
     contours: &Contours,
     plan: &Plan,
     ctx: &Ctx,
@@ -262,7 +309,7 @@ fn shell_of(
     let by = |halvings: i32, ctx: &Ctx| {
         let cell_mm = contours.pixel_mm * 0.5_f64.powi(halvings);
         let cell = PolygoniseSettings { cell_mm, ..PolygoniseSettings::default() };
-        let (rough, _) = surface::polygonise(&bounded(field, contours), f.wall(), &cell, &ctx.part(0.0, 0.1))?;
+        let (rough, _) = surface::polygonise(&bounded(field, contours), &seeds.wall, &cell, &ctx.part(0.0, 0.1))?;
         let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
         Ok((remeshed(&cut, field, contours, plan, &ctx.part(0.2, 1.0))?, report.caps))
     };
@@ -277,15 +324,16 @@ fn shell_of(
     Ok(Shell { mesh, caps, displacement })
 }
 
-fn measured(shell: Shell, field: &Sampled, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
+fn measured(shell: Shell, field: Sampled, hausdorff_mm: f64, plan: &Plan, ctx: &Ctx) -> Result<Wall, surface::Error> {
     let Shell { mesh, caps, displacement } = shell;
     let topology = surface::check(&mesh)?;
-    let quality = surface::quality(&mesh, field, ctx)?;
+    let quality = surface::quality(&mesh, &field, ctx)?;
     let ids: Vec<u32> = (0..caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
-    let (extended, warnings) = extended(&mesh, field, caps.len() as u32, plan, ctx)?;
+    let (extended, warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
     let beside = beside(&mesh, &caps);
-    Ok(Wall { mesh, caps, beside, topology, quality, displacement, patches, extended, warnings })
+    let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
+    Ok(Wall { mesh, caps, beside, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
 }
 
 fn remeshed(
@@ -343,40 +391,10 @@ fn beside(mesh: &TriMesh, caps: &[surface::Cap]) -> Vec<[u32; 2]> {
     caps.iter().map(|c| [c.face_id, largest(c.face_id)]).filter(|[id, largest]| id != largest).collect()
 }
 
-/// The wall's stage calls two crates.
-#[derive(Debug, thiserror::Error)]
-enum MeshFault {
-    #[error(transparent)]
-    Surface(#[from] surface::Error),
-    #[error(transparent)]
-    Implicit(#[from] implicit::Error),
-}
-
-impl space::Faulty for MeshFault {
-    fn kind(&self) -> FaultKind {
-        match self {
-            Self::Surface(e) => e.kind(),
-            Self::Implicit(e) => e.kind(),
-        }
-    }
-    fn code(&self) -> &'static str {
-        match self {
-            Self::Surface(e) => e.code(),
-            Self::Implicit(e) => e.code(),
-        }
-    }
-    fn place(&self) -> space::Place {
-        match self {
-            Self::Surface(e) => e.place(),
-            Self::Implicit(e) => e.place(),
-        }
-    }
-}
-
 /// Medial lines of the unsmoothed image of f: the numbers come from the data, not from the smoothed wall.
 fn medial_lines(
     sampled: &Sampled,
-    f: &Variational,
+    seeds: &[P3],
     contours: &Contours,
     wall: &Wall,
     ctx: &Ctx,
@@ -387,17 +405,23 @@ fn medial_lines(
         .filter(|c| wall.beside.iter().all(|&[small, _]| small != c.face_id))
         .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
         .collect();
-    let seeds = within(contours, f.inner());
-    skeleton::medial_graph(sampled, &contours.cuts, &caps, &seeds, &skeleton::Settings::default(), ctx)
+    skeleton::medial_graph(sampled, &contours.cuts, &caps, seeds, &skeleton::Settings::default(), ctx)
 }
 
-fn surface_data<'a>(wall: &'a Wall, pixel_mm: f64, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceData<'a> {
+fn surface_data<'a>(
+    wall: &'a Wall,
+    pixel_mm: f64,
+    graph: &MedialGraph,
+    morphometry: &Morphometry,
+    patched: &'a Patched,
+) -> SurfaceData<'a> {
     SurfaceData {
         mesh: &wall.mesh,
         quality: facts::surface(wall, pixel_mm, graph, morphometry),
         displacement_mm: &wall.displacement.mm,
         displacement_px: &wall.displacement.px,
         patches: Some(facts::patches(&wall.patches)),
+        quads: patched.facts(),
     }
 }
 

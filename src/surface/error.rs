@@ -209,6 +209,14 @@ pub enum Error {
         /// What the factorisation said.
         reason: String,
     },
+    /// The wall has no division into quadrilaterals.
+    #[error("no quadrilateral patches: {reason}")]
+    Patches {
+        /// Why.
+        reason: String,
+        /// Where.
+        at: P3,
+    },
     /// The list of patch ids does not fit the caps.
     #[error("{ids} patch ids were given for {caps} caps: one id per cap, in the order of their face ids")]
     PatchIds {
@@ -260,6 +268,7 @@ impl Faulty for Error {
             Self::ExtensionMeets { .. } => "surface.extension_meets",
             Self::PatchSolve { .. } => "surface.patch_solve",
             Self::PatchIds { .. } => "surface.patch_ids",
+            Self::Patches { .. } => "surface.patches",
         }
     }
     fn place(&self) -> Place {
@@ -276,6 +285,7 @@ impl Faulty for Error {
             | Self::ObliqueEnd { at, .. }
             | Self::ShortEnd { at, .. }
             | Self::ExtensionMeets { at, .. }
+            | Self::Patches { at, .. }
             | Self::TooManyTriangles { at, .. } => Place::at(*at),
             Self::Projection { vertex, at, .. } => Place { element: Some(*vertex), ..Place::at(*at) },
             Self::Folded { face, at } => Place { element: Some(*face), ..Place::at(*at) },

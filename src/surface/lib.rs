@@ -7,6 +7,8 @@
 
 mod cap;
 mod cut;
+#[cfg(test)]
+mod dent;
 mod distance;
 mod ends;
 mod error;
@@ -22,6 +24,7 @@ mod patch;
 mod phantoms;
 mod polish;
 mod polygonise;
+mod quads;
 mod quality;
 mod remesh;
 mod ring;
@@ -42,6 +45,7 @@ pub use land::{ProjectReport, project};
 pub use mesh::{TriMesh, WALL};
 pub use patch::{Patches, patches};
 pub use polygonise::{PolygoniseReport, PolygoniseSettings, polygonise};
+pub use quads::{QuadSettings, Quads, quads};
 pub use quality::{Quality, quality};
 pub use remesh::{RemeshReport, RemeshSettings, Sizing, remesh};
 pub use topology::{Defect, DefectKind, Topology, check, topology};

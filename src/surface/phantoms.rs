@@ -26,6 +26,10 @@ pub(crate) struct Phantom {
     pub(crate) seed: P3,
     pub(crate) cuts: Vec<CutPlane>,
     pub(crate) euler: i64,
+    /// Vessels that meet in its junction; 0 without one.
+    pub(crate) branches: usize,
+    /// Sections that open its loops.
+    pub(crate) sections: Vec<CutPlane>,
 }
 
 /// Planes across the z axis at plus and minus a height.
@@ -38,11 +42,14 @@ pub(crate) fn phantom(dice: &mut Dice, kind: usize) -> Phantom {
     match kind % 4 {
         0 => {
             let (ring, tube) = (dice.between(4.0, 5.0), dice.between(1.2, 1.8));
-            Phantom { field: fields::torus(ring, tube), seed: P3::new(ring + tube, 0.0, 0.0), cuts: vec![], euler: 0 }
+            let sections = vec![CutPlane::new(P3::new(ring, 0.0, 0.0), V3::Y).within(2.0 * tube)];
+            let (field, seed) = (fields::torus(ring, tube), P3::new(ring + tube, 0.0, 0.0));
+            Phantom { field, seed, cuts: vec![], euler: 0, branches: 0, sections }
         }
         1 => {
             let r = dice.between(2.0, 3.0);
-            Phantom { field: fields::sphere(P3::ORIGIN, r), seed: P3::new(r, 0.0, 0.0), cuts: vec![], euler: 2 }
+            let field = fields::sphere(P3::ORIGIN, r);
+            Phantom { field, seed: P3::new(r, 0.0, 0.0), cuts: vec![], euler: 2, branches: 0, sections: vec![] }
         }
         2 => {
             let (angle, r) = (dice.between(0.6, 1.4), dice.between(1.2, 2.0));
@@ -52,7 +59,7 @@ pub(crate) fn phantom(dice: &mut Dice, kind: usize) -> Phantom {
                 (V3::new(angle.sin(), 0.0, angle.cos()), 12.0, r),
             ];
             let field = fields::tree(branches, vec![1.0, 1.5]);
-            Phantom { field, seed: P3::new(0.0, 0.0, 13.6), cuts: ends(9.0), euler: 2 }
+            Phantom { field, seed: P3::new(0.0, 0.0, 13.6), cuts: ends(9.0), euler: 2, branches: 3, sections: vec![] }
         }
         _ => {
             let (a, b) = (dice.between(0.7, 1.2), dice.between(0.7, 1.2));
@@ -63,7 +70,7 @@ pub(crate) fn phantom(dice: &mut Dice, kind: usize) -> Phantom {
                 (V3::new(-b.sin(), 0.1, b.cos()).normalised().unwrap_or(V3::Y), 12.0, dice.between(1.1, 1.6)),
             ];
             let field = fields::tree(branches, vec![1.0, 1.0, 1.5]);
-            Phantom { field, seed: P3::new(0.0, 0.0, -13.8), cuts: ends(7.0), euler: 2 }
+            Phantom { field, seed: P3::new(0.0, 0.0, -13.8), cuts: ends(7.0), euler: 2, branches: 4, sections: vec![] }
         }
     }
 }

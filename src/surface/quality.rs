@@ -19,6 +19,11 @@ pub struct Quality {
     pub max_aspect: f64,
     /// Mean aspect.
     pub mean_aspect: f64,
+    /// Largest equiangular skew: how far the angles stray from 60 degrees, 0 equilateral to 1 flat,
+    /// max((largest - 60) / 120, (60 - smallest) / 60).
+    pub max_skew: f64,
+    /// Mean skew.
+    pub mean_skew: f64,
     /// Largest distance of a wall vertex from f = 0, mm.
     pub vertex_max_mm: f64,
     /// Largest distance of a point inside a wall face (centre or middle of an edge) from f = 0, mm.
@@ -56,6 +61,9 @@ pub fn quality(mesh: &TriMesh, field: &dyn Field, ctx: &Ctx) -> Result<Quality, 
         q.mean_aspect += aspect / n as f64;
         q.max_angle_deg = q.max_angle_deg.max(most.to_degrees());
         q.max_aspect = q.max_aspect.max(aspect);
+        let skew = ((most.to_degrees() - 60.0) / 120.0).max((60.0 - least.to_degrees()) / 60.0);
+        q.max_skew = q.max_skew.max(skew);
+        q.mean_skew += skew / n as f64;
         if least.to_degrees() < q.min_angle_deg {
             q.min_angle_deg = least.to_degrees();
             q.worst = t;
@@ -98,4 +106,29 @@ fn distances(mesh: &TriMesh, field: &dyn Field, q: &mut Quality, ctx: &Ctx) -> R
     }
     q.face_rms_mm = if area > 0.0 { (square / area).sqrt() } else { 0.0 };
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::fields;
+
+    #[test]
+    fn shapes_and_distances_have_their_closed_forms() {
+        // An equilateral triangle and a right-angled one with its corners on a sphere of radius 1.
+        let p = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]];
+        let vertices = p.map(|[x, y, z]| P3::new(x, y, z)).to_vec();
+        let mesh = TriMesh { vertices, triangles: vec![[0, 1, 2], [0, 1, 3]], face_id: vec![WALL; 2] };
+        let q = quality(&mesh, &fields::sphere(P3::ORIGIN, 1.0), &Ctx::new(1).unwrap()).unwrap();
+        assert!((q.max_angle_deg - 90.0).abs() < 1e-9 && (q.min_angle_deg - 45.0).abs() < 1e-9);
+        assert!((q.mean_min_angle_deg - 52.5).abs() < 1e-9);
+        assert!((q.max_skew - 0.25).abs() < 1e-9 && (q.mean_skew - 0.125).abs() < 1e-9, "{q:?}");
+        // Longest edge over 2 sqrt(3) r: 2 / (sqrt(12) (sqrt(2) - 1)) and 1.
+        let right = 2.0 / (12_f64.sqrt() * (2_f64.sqrt() - 1.0));
+        assert!((q.max_aspect - right).abs() < 1e-9 && (q.mean_aspect - 0.5 * (1.0 + right)).abs() < 1e-9);
+        assert!(q.vertex_max_mm < 1e-12 && q.worst == 1);
+        // The middle of the long edge is the centre of the sphere.
+        assert!((q.face_max_mm - 1.0).abs() < 1e-9 && q.farthest_at.distance(P3::ORIGIN) < 1e-9);
+    }
 }

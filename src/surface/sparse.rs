@@ -30,12 +30,63 @@ pub(crate) fn harmonic(
     jump: impl Fn(usize, usize) -> f64,
     ctx: &Ctx,
 ) -> Result<Vec<f64>, Error> {
+    harmonic_by(mesh, triangles, given, jump, |t| half_cotangents(mesh, t), ctx)
+}
+
+/// As [`harmonic`] with other weights, in the order of [`half_cotangents`].
+pub(crate) fn harmonic_by(
+    mesh: &TriMesh,
+    triangles: &[usize],
+    given: &[Option<f64>],
+    jump: impl Fn(usize, usize) -> f64,
+    weights: impl Fn(usize) -> [f64; 3],
+    ctx: &Ctx,
+) -> Result<Vec<f64>, Error> {
+    let (diagonal, b) = (vec![0.0; mesh.vertices.len()], vec![0.0; mesh.vertices.len()]);
+    minimum(System { mesh, triangles, given, diagonal, b }, jump, weights, ctx)
+}
+
+/// Values after heat has flowed for a time, mm2, in one implicit step; no flow through the border but to given values.
+pub(crate) fn diffused(
+    mesh: &TriMesh,
+    start: &[f64],
+    given: &[Option<f64>],
+    time: f64,
+    ctx: &Ctx,
+) -> Result<Vec<f64>, Error> {
+    let all: Vec<usize> = (0..mesh.triangles.len()).collect();
+    let mut mass = vec![0.0; start.len()];
+    for &t in &all {
+        // A third of its area to each corner.
+        let share = mesh.area_vector(t).length() / (6.0 * time);
+        mesh.triangles[t].iter().for_each(|&v| mass[v as usize] += share);
+    }
+    let b = mass.iter().zip(start).map(|(m, s)| m * s).collect();
+    let system = System { mesh, triangles: &all, given, diagonal: mass, b };
+    minimum(system, |_, _| 0.0, |t| half_cotangents(mesh, t), ctx)
+}
+
+/// What is solved, but for the weights.
+struct System<'a> {
+    mesh: &'a TriMesh,
+    triangles: &'a [usize],
+    given: &'a [Option<f64>],
+    diagonal: Vec<f64>,
+    b: Vec<f64>,
+}
+
+/// Minimise half x A x - b x, A being the weights' Laplacian and a diagonal.
+fn minimum(
+    system: System<'_>,
+    jump: impl Fn(usize, usize) -> f64,
+    weights: impl Fn(usize) -> [f64; 3],
+    ctx: &Ctx,
+) -> Result<Vec<f64>, Error> {
+    let System { mesh, triangles, given, mut diagonal, mut b } = system;
     let n = mesh.vertices.len();
     let mut row: Vec<Vec<(u32, f64)>> = vec![Vec::new(); n];
-    let mut diagonal = vec![0.0; n];
-    let mut b = vec![0.0; n];
     for &t in triangles {
-        let (w, c) = (half_cotangents(mesh, t), mesh.triangles[t]);
+        let (w, c) = (weights(t), mesh.triangles[t]);
         for (k, &weight) in w.iter().enumerate() {
             let (ki, kj) = ((k + 1) % 3, (k + 2) % 3);
             for (ki, kj) in [(ki, kj), (kj, ki)] {

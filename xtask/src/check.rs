@@ -1,6 +1,6 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
-use crate::{drawn, shell, storm, survey, tools};
+use crate::{drawn, shell, storm, surfaces, survey, tools};
 use anyhow::{Result, bail};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,10 @@ const SEEDS: u64 = 3;
 const DRAWN: u64 = 25;
 
 /// Random vessels whose surfaces another program judges (the whole survey takes 200).
-const SURFACES: &str = "20";
+const SURFACES: u64 = 20;
+
+/// Of those, how many Gmsh and TetGen fill with tetrahedra (the whole survey: 50).
+const FILLED: usize = 8;
 
 /// Run all checks.
 pub(crate) fn all() -> Result<()> {
@@ -62,22 +65,20 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     let mut phantom = shell::command(binary);
     phantom.args(["phantom", "anastomosis", "--seed", "1", "--out"]).arg(&scan);
     shell::run(phantom)?;
+    let plan = work.join("plan.json");
+    fs::write(&plan, with_patches(&fs::read(scan.join("plan.json"))?)?)?;
     let mut run = shell::command(binary);
-    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json")).arg("--out").arg(&out);
+    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(&plan).arg("--out").arg(&out);
     shell::run(run)?;
     let surfaces = work.join("surfaces");
-    fs::create_dir_all(&surfaces)?;
-    let mut survey = shell::command("cargo");
-    survey.args(["run", "--release", "--quiet", "-p", "surface", "--example", "survey", "--", SURFACES, "0"]);
-    survey.arg(&surfaces);
-    shell::run(survey)?;
-    let python = tools::python()?;
+    surfaces::meshes(&surfaces, SURFACES, 0)?;
+    surfaces::volumes(&surfaces, FILLED)?;
+    let python = tools::volume_judges()?;
     tools::deploy()?;
     tools::pacs()?;
     tools::strace()?;
     tools::groff()?;
     tools::jq()?;
-    tools::gmsh(&python)?;
     let node = tools::node_packages()?;
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&python);
@@ -103,6 +104,13 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
         shell::run(judge)?;
     }
     Ok(())
+}
+
+/// The same plan, asking for patches too.
+fn with_patches(plan: &[u8]) -> Result<Vec<u8>> {
+    let mut plan: serde_json::Value = serde_json::from_slice(plan)?;
+    plan["outputs"] = serde_json::json!(["surface", "skeleton", "patches"]);
+    Ok(serde_json::to_vec(&plan)?)
 }
 
 fn scripts(folder: &str, extension: &str) -> Result<Vec<PathBuf>> {

@@ -6,6 +6,7 @@ mod drawn;
 mod fuzz;
 mod shell;
 mod storm;
+mod surfaces;
 mod survey;
 mod tools;
 
@@ -33,11 +34,15 @@ enum Command {
     },
     /// Install what the tests need, then run every check.
     Test,
-    /// Reconstruct many simulated scans and compare them with the truth: ten noise seeds of the demo scan, or random vessels.
+    /// Reconstruct many simulated scans and compare them with the truth: ten noise seeds of the demo scan, or random vessels;
+    /// or let other programs judge the surfaces of random vessels.
     Survey {
         /// Number of random vessels, each with a scan of its own resolution and noise.
         #[arg(long)]
         count: Option<u64>,
+        /// Number of random vessels of whose surfaces other programs judge, without scans.
+        #[arg(long, conflicts_with = "count")]
+        surfaces: Option<u64>,
         /// First seed.
         #[arg(long, default_value_t = 1)]
         first: u64,
@@ -91,8 +96,9 @@ fn run(command: Command) -> Result<()> {
     match command {
         Command::Demo { seed, keep } => demo(seed, keep),
         Command::Test => check::all(),
-        Command::Survey { count: None, first } => survey::run(&tools::release_binary()?, first, 10),
-        Command::Survey { count: Some(count), first } => drawn::run(&tools::release_binary()?, first, count),
+        Command::Survey { surfaces: Some(count), first, .. } => surfaces::run(count, first.saturating_sub(1)),
+        Command::Survey { count: None, first, .. } => survey::run(&tools::release_binary()?, first, 10),
+        Command::Survey { count: Some(count), first, .. } => drawn::run(&tools::release_binary()?, first, count),
         Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),

@@ -33,6 +33,7 @@ const PYTHON_PACKAGES: &[&str] = &[
     "requests<3",
     "openapi-python-client==0.29.1",
     "gmsh==4.15.2",
+    "tetgen==0.8.4",
     "meshio==5.3.5",
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
@@ -120,15 +121,19 @@ pub(crate) fn deploy() -> Result<()> {
     apt("Prometheus and nginx (they read the files of deploy/)", &["prometheus", "nginx-light"])
 }
 
-/// Libraries that Gmsh from PyPI wants though it opens no window; `python` is the interpreter that has it.
-pub(crate) fn gmsh(python: &Path) -> Result<()> {
-    let mut ask = shell::command(python);
-    ask.args(["-c", "import gmsh"]);
-    if shell::succeeds(ask) {
-        return Ok(());
+/// Python with the judges of volumes and the libraries that Gmsh wants though it opens no window; the path of its
+/// interpreter.
+pub(crate) fn volume_judges() -> Result<PathBuf> {
+    let python = python()?;
+    let mut load = shell::command(&python);
+    load.args(["-c", "import gmsh, tetgen"]);
+    if !shell::succeeds(load) {
+        let libraries =
+            ["libglu1-mesa", "libgl1", "libopengl0", "libxcursor1", "libxfixes3", "libxft2", "libxinerama1"];
+        let packages = [&libraries[..], &["libxrender1", "libgomp1"]].concat();
+        apt("libraries of Gmsh (it fills our surfaces with tetrahedra)", &packages)?;
     }
-    let packages = ["libglu1-mesa", "libxcursor1", "libxft2", "libxinerama1", "libxrender1", "libgomp1"];
-    apt("libraries of Gmsh (it fills our surface with tetrahedra)", &packages)
+    Ok(python)
 }
 
 /// What reads JSON in a shell, for the guide's commands.

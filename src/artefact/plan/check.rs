@@ -137,7 +137,7 @@ const PLAN: &[(&str, Rule)] = &[
         "morphometry",
         Object(&[("fit_from_diameters", Number(0.0, 100.0)), ("fit_to_diameters", Number(0.1, 100.0))], Optional),
     ),
-    ("outputs", Words(&["surface", "skeleton", "volume", "graphml", "swc", "field"])),
+    ("outputs", Words(&["surface", "skeleton", "volume", "graphml", "swc", "field", "patches"])),
     ("variant", Object(&[("changes", Objects(CHANGE))], Optional)),
 ];
 

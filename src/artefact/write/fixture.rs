@@ -3,8 +3,8 @@
 
 use crate::Reconstruction;
 use crate::reconstruction::{
-    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Range, SegmentationFacts, SlicePicture, SurfaceData,
-    SurfaceFacts,
+    Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, Quadrilaterals, QualityFacts, Range, SegmentationFacts,
+    SlicePicture, SurfaceData, SurfaceFacts,
 };
 use imaging::{Axis, Contours};
 use morphometry::{
@@ -268,6 +268,7 @@ impl Fixture {
         let cap = |k: usize| CapFacts {
             face_id: k as u32 + 1,
             name: format!("end_{}", ARMS[k].2.name()),
+            boundary: ["inlet_1", "inlet_2", "outlet_1"][k].to_owned(),
             centroid: CENTRE + V3::from(ARMS[k].0),
             normal: V3::from(ARMS[k].0).normalised().unwrap(),
             area_mm2: 20.0,
@@ -310,11 +311,13 @@ impl Fixture {
                     volume_mm3: self.area_and_volume[1],
                     displacement_px: range(2.0),
                     displacement_mm: range(1.0),
+                    report: QualityFacts { hausdorff_mm: 0.2, volume_change: -0.004, ..QualityFacts::default() },
                     caps: (0..3).map(cap).collect(),
                 },
                 displacement_mm: &self.displacement,
                 displacement_px: &self.displacement,
                 patches: Some(Patches { patch_id: &self.patch_id, u: &self.uv, v: &self.uv }),
+                quads: Quadrilaterals::Unasked,
             },
             graph: &self.graph,
             morphometry: &self.morphometry,

@@ -13,6 +13,7 @@ use super::error::same_length;
 use super::vtp::{Array, PolyData};
 use super::{CONTOURS_VTP, Error, NamedBytes, SKELETON_VTP, SURFACE_VTP};
 use crate::Reconstruction;
+use crate::reconstruction::CapFacts;
 use imaging::Contours;
 use morphometry::{Branch, Role, Section};
 use skeleton::Edge;
@@ -60,7 +61,7 @@ pub(crate) fn checked_mesh(artefact: &'static str, mesh: &TriMesh) -> Result<(),
 
 /// surface.vtp: the triangles with point arrays `Normals`, `Displacement_mm`, `Displacement_px` (0 when nothing was
 /// smoothed), `U` and `V`, and cell arrays `FaceId` (0 wall, k >= 1 the k-th cap) and `PatchId` (both patch arrays only
-/// when patches were made).
+/// when patches were made). The field array `FaceNames` names each face id: `wall`, `inlet`, `outlet_1` and so on.
 ///
 /// # Errors
 /// [`Error::Mismatch`], [`Error::NotFinite`].
@@ -82,11 +83,21 @@ pub fn surface_vtp(r: &Reconstruction<'_>) -> Result<Vec<u8>, Error> {
     let data = PolyData {
         points: s.mesh.vertices.clone(),
         polygons: s.mesh.triangles.clone(),
+        words: vec![("FaceNames", face_names(&s.quality.caps))],
         point_arrays,
         cell_arrays,
         ..PolyData::default()
     };
     data.write(SURFACE_VTP)
+}
+
+/// The boundary's name of every face id.
+fn face_names(caps: &[CapFacts]) -> Vec<String> {
+    let most = caps.iter().map(|c| c.face_id as usize).max().unwrap_or(0);
+    let mut names = vec![String::new(); most + 1];
+    names[WALL as usize] = "wall".to_owned();
+    caps.iter().for_each(|c| names[c.face_id as usize].clone_from(&c.boundary));
+    names
 }
 
 /// A surface without measures (opened, or with flow extensions): `Normals`, and `FaceId` as in surface.vtp.

@@ -26,6 +26,7 @@ mod stl;
 mod style;
 mod trees;
 mod vtp;
+mod vtu;
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -46,9 +47,11 @@ pub use sections::sections_json;
 pub use slices::slice_pictures;
 pub use stl::surface_stl;
 pub use trees::{skeleton_graphml, skeleton_swc};
+pub use vtu::patches_vtu;
 
 pub use crate::NamedBytes;
 use crate::Reconstruction;
+use crate::reconstruction::Quadrilaterals;
 
 /// The numbers.
 pub const RESULT_JSON: &str = "result.json";
@@ -74,6 +77,8 @@ pub const SURFACE_STL: &str = "surface.stl";
 pub const SURFACE_OPEN_VTP: &str = "surface_open.vtp";
 /// The surface with flow extensions, closed; caps carry the face ids of surface.vtp.
 pub const SURFACE_EXTENDED_VTP: &str = "surface_extended.vtp";
+/// The wall as quadrilaterals of high order, when asked for.
+pub const PATCHES_VTU: &str = "patches.vtu";
 /// The contours for VTK.
 pub const CONTOURS_VTP: &str = "contours.vtp";
 /// The page to read and print.
@@ -108,7 +113,8 @@ pub fn media_type(name: &str) -> &'static str {
     }
 }
 
-/// The artefacts that `outputs` of the plan ask for beyond [`write_all`]: `graphml` and `swc`.
+/// The artefacts that `outputs` of the plan ask for beyond [`write_all`]: `graphml`, `swc`, and `patches` where the wall could be
+/// divided.
 ///
 /// # Errors
 /// [`Error::Loops`] for `swc` of a graph with loops; [`Error::NotFinite`].
@@ -120,6 +126,9 @@ pub fn write_asked(r: &Reconstruction<'_>, outputs: &[String]) -> Result<Vec<Nam
     }
     if asked("swc") {
         files.push(NamedBytes { name: SKELETON_SWC.into(), bytes: skeleton_swc(r)? });
+    }
+    if let Quadrilaterals::Made(quads) = r.surface.quads {
+        files.push(NamedBytes { name: PATCHES_VTU.into(), bytes: patches_vtu(quads)? });
     }
     Ok(files)
 }

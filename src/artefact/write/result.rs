@@ -1,7 +1,7 @@
 //! result.json and skeleton.json: the numbers, under the names and in the order of contract.md.
 //!
 //! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
-//! `displacement_mm`, `patches` and `caps`; `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
+//! `displacement_mm`, `patches`, `quads` (where asked for), `quality` and `caps` (with `boundary`); `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
 //! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`;
 //! `variant` where the result is a re-synthesis.
 //! What could not be had is null.
@@ -10,7 +10,7 @@ use super::json::{Json, warning};
 use super::{Error, RESULT_JSON, SKELETON_JSON};
 use crate::Reconstruction;
 use crate::plan::{self, VariantChange};
-use crate::reconstruction::{CapFacts, Range};
+use crate::reconstruction::{CapFacts, Quadrilaterals, QualityFacts, Range};
 use morphometry::{Angle, Branch, Helix, Junction, Section, Stenosis, VmtkAngles};
 use skeleton::{MedialGraph, NodeKind};
 
@@ -84,7 +84,7 @@ fn surface(r: &Reconstruction<'_>) -> Json {
     let s = &r.surface;
     let q = &s.quality;
     let patches = s.patches.map(|p| p.patch_id.iter().max().map_or(0, |&m| m as usize + 1));
-    Json::Object(vec![
+    let mut members = vec![
         ("vertices", s.mesh.vertices.len().into()),
         ("triangles", s.mesh.triangles.len().into()),
         ("area_mm2", q.area_mm2.into()),
@@ -99,6 +99,49 @@ fn surface(r: &Reconstruction<'_>) -> Json {
         ("max_angle_deg", q.max_angle_deg.into()),
         ("patches", patches.into()),
         ("caps", Json::List(q.caps.iter().map(cap).collect())),
+        ("quality", quality(&q.report)),
+    ];
+    match s.quads {
+        Quadrilaterals::Unasked => {}
+        Quadrilaterals::Impossible => members.push(("quads", Json::Null)),
+        Quadrilaterals::Made(q) => members.push(("quads", quads(q))),
+    }
+    Json::Object(members)
+}
+
+fn quality(r: &QualityFacts) -> Json {
+    let q = &r.mesh;
+    let worst =
+        vec![("face", q.worst.into()), ("position", q.worst_at.into()), ("min_angle_deg", q.min_angle_deg.into())];
+    Json::Object(vec![
+        ("min_angle_deg", q.min_angle_deg.into()),
+        ("mean_min_angle_deg", q.mean_min_angle_deg.into()),
+        ("max_angle_deg", q.max_angle_deg.into()),
+        ("max_aspect", q.max_aspect.into()),
+        ("mean_aspect", q.mean_aspect.into()),
+        ("max_skew", q.max_skew.into()),
+        ("mean_skew", q.mean_skew.into()),
+        ("vertex_max_mm", q.vertex_max_mm.into()),
+        ("face_max_mm", q.face_max_mm.into()),
+        ("face_rms_mm", q.face_rms_mm.into()),
+        ("farthest_at", q.farthest_at.into()),
+        ("hausdorff_unsmoothed_mm", r.hausdorff_mm.into()),
+        ("volume_change_percent", (100.0 * r.volume_change).into()),
+        ("worst", Json::Object(worst)),
+    ])
+}
+
+fn quads(q: &surface::Quads) -> Json {
+    Json::Object(vec![
+        ("order", q.order.into()),
+        ("patches", q.cells.len().into()),
+        ("nodes", q.nodes.len().into()),
+        ("poles", Json::list(q.poles.iter().copied())),
+        ("separating_mm", q.separating_mm.into()),
+        ("max_error_mm", q.max_error_mm.into()),
+        ("max_error_at", q.farthest_at.into()),
+        ("min_jacobian", q.least_jacobian.into()),
+        ("min_sine", q.least_sine.into()),
     ])
 }
 
@@ -106,6 +149,7 @@ fn cap(c: &CapFacts) -> Json {
     Json::Object(vec![
         ("face_id", c.face_id.into()),
         ("name", (&c.name).into()),
+        ("boundary", (&c.boundary).into()),
         ("centroid", c.centroid.into()),
         ("normal", c.normal.into()),
         ("area_mm2", c.area_mm2.into()),

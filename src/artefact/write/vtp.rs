@@ -18,6 +18,8 @@ pub(crate) enum Values {
     Id(Vec<i32>),
     /// Int64, for connectivity.
     Index(Vec<i64>),
+    /// UInt8, for cell types.
+    Byte(Vec<u8>),
 }
 
 /// What a missing value in an array means.
@@ -59,11 +61,16 @@ impl Array {
     fn index(name: &'static str, values: Vec<i64>) -> Self {
         Self { name, components: 1, values: Values::Index(values), gaps: Gaps::Refused }
     }
+    /// One byte per cell.
+    pub(crate) fn byte(name: &'static str, values: Vec<u8>) -> Self {
+        Self { name, components: 1, values: Values::Byte(values), gaps: Gaps::Refused }
+    }
     fn len(&self) -> usize {
         match &self.values {
             Values::Real(v) => v.len(),
             Values::Id(v) => v.len(),
             Values::Index(v) => v.len(),
+            Values::Byte(v) => v.len(),
         }
     }
     fn type_name(&self) -> &'static str {
@@ -71,6 +78,7 @@ impl Array {
             Values::Real(_) => "Float64",
             Values::Id(_) => "Int32",
             Values::Index(_) => "Int64",
+            Values::Byte(_) => "UInt8",
         }
     }
     fn append(&self, raw: &mut Vec<u8>) {
@@ -78,11 +86,12 @@ impl Array {
             Values::Real(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
             Values::Id(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
             Values::Index(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Values::Byte(v) => v.clone(),
         };
         raw.extend_from_slice(&(bytes.len() as u64).to_le_bytes());
         raw.extend_from_slice(&bytes);
     }
-    fn check(&self, artefact: &'static str, count: usize) -> Result<(), Error> {
+    pub(crate) fn check(&self, artefact: &'static str, count: usize) -> Result<(), Error> {
         same_length(artefact, self.name, count * self.components, self.len())?;
         match (&self.values, self.gaps) {
             (Values::Real(v), Gaps::Refused) => all_finite(artefact, self.name, v),
@@ -97,6 +106,8 @@ pub(crate) struct PolyData {
     pub points: Vec<P3>,
     pub lines: Vec<Vec<usize>>,
     pub polygons: Vec<[u32; 3]>,
+    /// Named lists of words that belong to the whole: the k-th word is that of id k.
+    pub words: Vec<(&'static str, Vec<String>)>,
     pub point_arrays: Vec<Array>,
     pub cell_arrays: Vec<Array>,
 }
@@ -126,6 +137,9 @@ impl PolyData {
             "<VTKFile type=\"PolyData\" version=\"1.0\" byte_order=\"LittleEndian\" header_type=\"UInt64\">\n",
         );
         xml.push_str("<!-- frame DICOM LPS, lengths in mm -->\n<PolyData>\n");
+        for (name, words) in &self.words {
+            xml.push_str(&field_words(name, words));
+        }
         xml.push_str(&format!(
             "<Piece NumberOfPoints=\"{}\" NumberOfVerts=\"0\" NumberOfLines=\"{}\" NumberOfStrips=\"0\" NumberOfPolys=\"{}\">\n",
             self.points.len(),
@@ -145,8 +159,18 @@ impl PolyData {
     }
 }
 
+/// Words as VTK's XML has them: the codes of their letters, each word ended by a 0.
+fn field_words(name: &str, words: &[String]) -> String {
+    let codes: String = words.iter().flat_map(|w| w.bytes().chain([0])).map(|b| format!("{b} ")).collect();
+    let n = words.len();
+    format!(
+        "<FieldData>\n<Array type=\"String\" Name=\"{name}\" NumberOfTuples=\"{n}\" format=\"ascii\">\n{}\n</Array>\n</FieldData>\n",
+        codes.trim_end()
+    )
+}
+
 /// Connectivity and offsets of some cells.
-fn topology<'a>(
+pub(crate) fn topology<'a>(
     artefact: &'static str,
     points: usize,
     cells: impl Iterator<Item = &'a [usize]>,
@@ -164,7 +188,7 @@ fn topology<'a>(
     Ok([Array::index("connectivity", connectivity), Array::index("offsets", offsets)])
 }
 
-fn section(xml: &mut String, raw: &mut Vec<u8>, tag: &str, arrays: &[Array]) {
+pub(crate) fn section(xml: &mut String, raw: &mut Vec<u8>, tag: &str, arrays: &[Array]) {
     let normals = if arrays.iter().any(|a| a.name == "Normals") { " Normals=\"Normals\"" } else { "" };
     xml.push_str(&format!("<{tag}{normals}>\n"));
     for a in arrays {
@@ -202,6 +226,7 @@ pub(crate) mod reader {
         let values = match attribute("type").as_str() {
             "Float64" => data.chunks(8).map(|c| f64::from_le_bytes(c.try_into().unwrap())).collect(),
             "Int64" => data.chunks(8).map(|c| i64::from_le_bytes(c.try_into().unwrap()) as f64).collect(),
+            "UInt8" => data.iter().map(|&b| f64::from(b)).collect(),
             "Int32" => data.chunks(4).map(|c| f64::from(i32::from_le_bytes(c.try_into().unwrap()))).collect(),
             other => panic!("type {other}"),
         };

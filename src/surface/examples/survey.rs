@@ -27,6 +27,10 @@ struct Line {
     ms: [f64; 3],
     cpu: f64,
     mesh: TriMesh,
+    /// The wall of adaptive meshes as quadrilaterals, and the time it took, ms.
+    quads: Option<(Result<Quads, Error>, f64)>,
+    /// Whether every vessel reaches a cap, so that there must be quadrilaterals.
+    open: bool,
 }
 
 fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f64, ctx: &Ctx) -> Result<Line, Error> {
@@ -54,7 +58,14 @@ fn run(name: &str, p: &Phantom, shift: [f64; 3], sizing: Sizing, max_error_mm: f
     let least = if matches!(sizing, Sizing::Curvature) { 30.0 } else { 33.0 };
     let cells_per = polygonised.cells_visited as f64 / polygonised.cells as f64;
     let quality = quality(&mesh, &p.field, ctx).unwrap();
-    Ok(Line { name: name.into(), quality, report, cells_per, sound, least, ms, cpu, mesh })
+    let quads = matches!(sizing, Sizing::Curvature).then(|| {
+        let t = Instant::now();
+        let quads = quads(&mesh, &p.field, &p.cuts, &p.sections, &QuadSettings::default(), ctx);
+        (quads, t.elapsed().as_secs_f64() * 1e3)
+    });
+    let caps = mesh.face_id.iter().copied().max().unwrap_or(WALL) as usize;
+    let open = !p.sections.is_empty() || (p.branches > 0 && caps == p.branches);
+    Ok(Line { name: name.into(), quality, report, cells_per, sound, least, ms, cpu, mesh, quads, open })
 }
 
 impl Line {
@@ -68,6 +79,15 @@ impl Line {
             && q.max_angle_deg <= 120.0
             && q.vertex_max_mm <= 1e-9
             && self.calls() <= 6.0
+            && self.patched()
+    }
+    /// Quadrilaterals within .01 mm, proven not to fold, wherever every vessel reaches a cap.
+    fn patched(&self) -> bool {
+        match &self.quads {
+            Some((Ok(q), _)) => q.max_error_mm <= 0.01 && q.least_jacobian > 0.0,
+            Some((Err(_), _)) => !self.open,
+            None => true,
+        }
     }
     fn show(&self) {
         let (q, r) = (&self.quality, &self.report);
@@ -89,6 +109,20 @@ impl Line {
             self.ms[2],
             if self.holds() { "" } else { "MISSED" }
         );
+        match &self.quads {
+            Some((Ok(q), ms)) => println!(
+                "{:<16} {} patches, {} nodes, {:.4} mm, least sine {:.2}, Jacobian {:.3}, {} poles, {ms:.0} ms",
+                "",
+                q.cells.len(),
+                q.nodes.len(),
+                q.max_error_mm,
+                q.least_sine,
+                q.least_jacobian,
+                q.poles.len(),
+            ),
+            Some((Err(e), _)) => println!("{:<16} {e}", ""),
+            None => {}
+        }
     }
 }
 
@@ -133,7 +167,14 @@ fn main() {
             refused += 1;
         }
     };
-    let benchmark = Phantom { field: fields::anastomosis(), seed: fields::tips()[0], cuts: vec![], euler: 2 };
+    let benchmark = Phantom {
+        field: fields::anastomosis(),
+        seed: fields::tips()[0],
+        cuts: vec![],
+        euler: 2,
+        branches: 0,
+        sections: vec![],
+    };
     for (name, sizing) in [("benchmark-.485", Sizing::Uniform(0.485)), ("benchmark-.02", Sizing::Curvature)] {
         keep(run(name, &benchmark, [0.0; 3], sizing, 0.02, &ctx), name, true);
     }
@@ -158,5 +199,25 @@ fn main() {
         -worst(&|l| -l.quality.min_angle_deg),
         worst(&|l| l.quality.max_angle_deg),
     );
+    patched(&lines);
     assert!(missed == 0, "{missed} meshes miss a bar");
+}
+
+/// All walls as quadrilaterals in one line.
+fn patched(lines: &[Line]) {
+    let quads: Vec<&Quads> = lines.iter().filter_map(|l| l.quads.as_ref()?.0.as_ref().ok()).collect();
+    let count = |f: &dyn Fn(&Quads) -> usize| quads.iter().map(|q| f(q)).sum::<usize>();
+    let least = |f: &dyn Fn(&Quads) -> f64| quads.iter().map(|q| f(q)).fold(f64::INFINITY, f64::min);
+    if quads.is_empty() {
+        return;
+    }
+    println!(
+        "{} walls as quadrilaterals: {} patches, {} poles, at most {:.4} mm, least sine {:.2}, least Jacobian {:.3} of the area",
+        quads.len(),
+        count(&|q| q.cells.len()),
+        count(&|q| q.poles.len()),
+        -least(&|q| -q.max_error_mm),
+        least(&|q| q.least_sine),
+        least(&|q| q.least_jacobian),
+    );
 }

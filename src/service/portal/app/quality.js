@@ -30,8 +30,10 @@ export function qualityCard({ input, segmentation, implicit, surface }) {
     ["quality.area", `${number(surface.area_mm2, 0)} mm², ${number(surface.volume_mm3, 0)} mm³`],
     ["quality.topology", t(surface.watertight ? "quality.closed" : "quality.open", { euler: surface.euler, pieces: surface.components })],
     ["quality.angles", `${number(surface.min_angle_deg)}° – ${number(surface.max_angle_deg)}°`],
+    ...(surface.quality ? [["quality.shapes", t("quality.shapes_of", { aspect: number(surface.quality.max_aspect, 2), skew: number(surface.quality.max_skew, 2) })]] : []),
     ["quality.error", mm(surface.max_error_mm)],
     ["quality.smoothing", t("quality.smoothing_of", { min: signed(d.min, 2), max: signed(d.max, 2), rms: number(d.rms, 2) })],
+    ...(surface.quality ? [["quality.volume", `${signed(surface.quality.volume_change_percent, 2)} %`]] : []),
   ];
   return card(t("quality.title"), table(t("quality.title"), [{ title: t("quality.what") }, { title: t("quality.value") }], rows.map(([key, value]) => [t(key), value])));
 }
