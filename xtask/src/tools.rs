@@ -5,7 +5,7 @@
 use crate::shell;
 use anyhow::{Context, Result, bail};
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Programs that judge our files; versions are pinned so that a green run stays green.
 const PYTHON_PACKAGES: &[&str] = &[
