@@ -2,8 +2,8 @@
 //!
 //! A global level errs wherever coil sensitivity, inflow or the tissue around change: the half-way level between the
 //! lumen and its surroundings is taken at every voxel instead. Inside: raw grey values of the mask, weighted by the cube
-//! of their depth (up to 3 px), so that the blurred rim does not pull the value down. Outside: raw values 2.5 to 4.7 px away
-//! from the mask; left out are those within 2.5 px of other bright structures, those into which the lumen runs on without a
+//! of their depth (up to 3 px), so that the blurred rim does not pull the value down. Outside: raw values 2 to 4 px away
+//! from the mask; left out are those within 2 px of other bright structures, those into which the lumen runs on without a
 //! wall (docs/adr/0031), and what the mask encloses within a plane, a dim core of a wide lumen. Both are spread by normalised convolution with
 //! Gaussians of growing width, so that near data decide where there are any. The mask then grows (or shrinks) to the
 //! component above the level within reach, and the levels are taken anew until nothing changes: a vessel is followed as
@@ -61,20 +61,21 @@ impl Fields {
 const TENTHS: f64 = 10.0;
 /// Depth at which a voxel counts in full, tenths of a pixel.
 const DEEP: u8 = 30;
-/// The ring of surroundings, tenths of a pixel from the mask's outermost voxels, which lie up to 1 px inside the wall. With its inner edge
-/// at 2 px the lumen's blur of .67 px reached in: levels .2 % of the contrast too high, .2 % of the area of a 3 mm vessel.
-const RING: (u8, u8) = (25, 47);
+/// The ring of surroundings, tenths of a pixel from the mask's outermost voxels: a point spread of .6 px has let go of
+/// 99.9 % of the lumen 2 px from the wall. Some of these voxels lie 1 px inside it, so that levels come out .2 % of the
+/// contrast too high; a ring from 2.5 px is free of that and finds no room between neighbours (docs/adr/0033).
+const RING: (u8, u8) = (20, 42);
 /// A voxel of the ring whose height above the surroundings of 10 mm is more than this share of that of the mask's rim beside it is
 /// no surroundings: there is no wall in between, the lumen runs on. Across a wall the share is 0 to .2 (the rim is at
 /// half height or above), ahead of a front in a fading vessel .8 to 1. Without this the aorta of a coil-faded scan
 /// takes its own dim continuation for background (level 360 where the lumen has 320) and breaks up in its last 10 rows.
 const RUNS_ON: f32 = 0.7;
 /// Slices thicker than this many pixels mix lumen and surroundings beyond the ring's inner edge: half a slice of a wall that
-/// leans by 60 degrees reaches .87 of its thickness, the ring begins at 2.5 px. In the thinner ones of the real angiogram (1.7 px) the
+/// leans by 60 degrees reaches .87 of its thickness, the ring begins at 2 px. In the thinner ones of the real angiogram (1.7 px) the
 /// ring between two iliac arteries must keep its weight, or they melt together.
 const MIXING_PX: f64 = 2.3;
 /// Weight of voxels that such a slice fills with both lumen and surroundings: those of the ring above or below which the lumen
-/// lies (within 2.5 px), and those of the lumen above or below which it does not. They count only where nothing else is near. With full weight a tube at 45 degrees in slices of 3 mm gets a level 1.5 % of its contrast too high, one at
+/// lies (within 2 px), and those of the lumen above or below which it does not. They count only where nothing else is near. With full weight a tube at 45 degrees in slices of 3 mm gets a level 1.5 % of its contrast too high, one at
 /// 60 degrees 5 %, which costs 1.4 and 5 % of its area.
 const PARTIAL: f32 = 0.02;
 /// Narrowest Gaussian of the inside values, mm: at 3 mm a vessel that fades to .4 within 35 mm comes out 1.4 % too small in area, because the mean is one-sided at its end.

@@ -273,7 +273,12 @@ fn wall(
         } else {
             break;
         };
-        let shell = shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9))?;
+        limit = report.sigma_mm * RETREAT;
+        let shell = match shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9)) {
+            // two lumens that all but touch: another smoothing parts or joins them
+            Err(e) if is_unresolved(&e) => continue,
+            shell => shell?,
+        };
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
             let back = TriMesh { vertices: image.wall, ..TriMesh::default() };
@@ -281,7 +286,6 @@ fn wall(
             let moved = moved.max(back.max_mm.max(-back.min_mm));
             return Ok(measured(shell, field, moved, plan, &ctx.part(0.9, 1.0))?);
         }
-        limit = report.sigma_mm * RETREAT;
     }
     let shell = shell_of(&image.sampled, (f, seeds), contours, plan, &ctx.part(0.0, 0.9))?;
     let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
@@ -299,6 +303,11 @@ struct Shell {
 /// mesh then joins what f separates, or the reverse, and no remeshing can lay it on f.
 const HALVINGS: i32 = 2;
 
+/// Whether a mesh was too coarse for the wall, or the wall is all but singular there.
+fn is_unresolved(e: &surface::Error) -> bool {
+    matches!(e, surface::Error::Folded { .. } | surface::Error::CrossedRim { .. })
+}
+
 fn shell_of(
     field: &Sampled,
     (f, seeds): (&Variational, &Seeds),
@@ -315,7 +324,7 @@ fn shell_of(
     };
     let mut meshed = by(0, &ctx.part(0.0, 0.8));
     for halvings in 1..=HALVINGS {
-        if matches!(meshed, Err(surface::Error::Folded { .. })) {
+        if meshed.as_ref().is_err_and(is_unresolved) {
             meshed = by(halvings, &ctx.part(0.0, 0.8));
         }
     }
