@@ -34,7 +34,7 @@ const same = (shown, wanted, what) => { assert.deepEqual(shown, wanted, what); c
 
 async function sent() {
   const form = new FormData();
-  form.append("plan", readFileSync(join(scan, "plan.json"), "utf8"));
+  form.append("plan", JSON.stringify(JSON.parse(readFileSync(join(out, "provenance.json"), "utf8")).plan));
   for (const name of readdirSync(join(scan, "dicom"))) form.append("input", new Blob([readFileSync(join(scan, "dicom", name))]), name);
   const { id } = await (await fetch(`${address}/v1/jobs`, { method: "POST", body: form })).json();
   for (let k = 0; k < 5; k += 1) if ((await (await fetch(`${address}/v1/jobs/${id}?wait=60`)).json()).finished_at) break;
