@@ -145,10 +145,6 @@ fn branch_rows(r: &Reconstruction<'_>) -> Vec<[String; 6]> {
         .collect()
 }
 
-fn place(p: space::P3) -> String {
-    format!("at LPS ({:.1}, {:.1}, {:.1}) mm", p.x(), p.y(), p.z())
-}
-
 fn quality(r: &Reconstruction<'_>) -> Vec<[String; 2]> {
     let (q, i, f) = (&r.surface.quality, &r.input, &r.implicit);
     let missing = match i.missing_slices.len() {
@@ -182,18 +178,7 @@ fn quality(r: &Reconstruction<'_>) -> Vec<[String; 2]> {
                 if q.components == 1 { "" } else { "s" }
             ),
         ),
-        (
-            "Triangle angles",
-            format!(
-                "{:.1}\u{b0} to {:.1}\u{b0}, smallest {:.1}\u{b0} in the mean",
-                q.min_angle_deg, q.max_angle_deg, q.report.mesh.mean_min_angle_deg
-            ),
-        ),
-        (
-            "Triangle shapes",
-            format!("aspect at most {:.2}, skew at most {:.2}", q.report.mesh.max_aspect, q.report.mesh.max_skew),
-        ),
-        ("Worst triangle", place(q.report.mesh.worst_at)),
+        ("Triangle angles", format!("{:.1}\u{b0} to {:.1}\u{b0}", q.min_angle_deg, q.max_angle_deg)),
         ("Mesh error", format!("{:.3} mm, {:.4} rms", q.max_error_mm, q.report.mesh.face_rms_mm)),
         (
             "Smoothing",
@@ -202,8 +187,6 @@ fn quality(r: &Reconstruction<'_>) -> Vec<[String; 2]> {
                 q.displacement_px.min, q.displacement_px.max, q.displacement_px.rms
             ),
         ),
-        ("Volume by smoothing", format!("{:+.2} %", 100.0 * q.report.volume_change)),
-        ("Hausdorff, unsmoothed", format!("{:.3} mm", q.report.hausdorff_mm)),
     ];
     rows.into_iter().map(|(k, v)| [k.to_owned(), v]).collect()
 }
