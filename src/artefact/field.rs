@@ -1,5 +1,6 @@
 //! field.bin: costly results of a run that a later one on the same scan takes again, each under the digest of all numbers from
-//! which it was computed. Made and read by the same program only: its digest stands in the head.
+//! which it was computed. Made and read by the same program only: its digest stands in the head, and that of all results after
+//! it, because a bit that has fallen over would be a wrong number without a word.
 
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -32,20 +33,28 @@ pub fn program(bytes: &[u8]) -> [u8; 32] {
     Sha256::digest(bytes).into()
 }
 
-/// field.bin: magic, the program's digest, then for each result its key, its length and its numbers, little-endian, by key.
+/// field.bin: magic, the program's digest, that of what follows, then for each result its key, its length and its numbers,
+/// little-endian, by key.
 pub fn written(program: &[u8; 32], results: &Results) -> Vec<u8> {
-    let mut out = [&MAGIC[..], program].concat();
+    let mut out = [&MAGIC[..], program, &[0; 32]].concat();
+    let head = out.len();
     for (key, values) in results {
         out.extend(key);
         out.extend((values.len() as u64).to_le_bytes());
         out.extend(values.iter().flat_map(|x| x.to_le_bytes()));
     }
+    let digest = Sha256::digest(&out[head..]);
+    out[head - 32..head].copy_from_slice(&digest);
     out
 }
 
-/// The results of a field.bin that this very program made; `None` of another one's, or where the file is not whole.
+/// The results of a field.bin that this very program made; `None` of another one's, or where the file is not as it was
+/// written.
 pub fn read(program: &[u8; 32], bytes: &[u8]) -> Option<Results> {
-    let mut rest = bytes.strip_prefix(MAGIC)?.strip_prefix(program)?;
+    let (digest, mut rest) = bytes.strip_prefix(MAGIC)?.strip_prefix(program)?.split_first_chunk::<32>()?;
+    if Sha256::digest(rest).as_slice() != digest {
+        return None;
+    }
     let mut results = Results::new();
     while !rest.is_empty() {
         let (key, more) = rest.split_first_chunk::<32>()?;
@@ -76,8 +85,10 @@ mod tests {
         for cut in [0, 20, 50, bytes.len() - 1] {
             assert!(read(&me, &bytes[..cut]).is_none(), "{cut}");
         }
-        let mut long = bytes.clone();
-        long[48 + 32..48 + 40].fill(255);
-        assert!(read(&me, &long).is_none(), "a length that lies");
+        for bit in [48, 80, 112, bytes.len() - 1] {
+            let mut fallen = bytes.clone();
+            fallen[bit] ^= 1;
+            assert!(read(&me, &fallen).is_none(), "a bit fell over at {bit}");
+        }
     }
 }

@@ -11,7 +11,7 @@ pub type Key = [u8; 32];
 pub trait Recall: Send + Sync {
     /// A digest of a result's name and of everything that it depends on.
     fn key(&self, name: &str, from: &[&[f64]]) -> Key;
-    /// The result, if an earlier run had it.
+    /// The result, if an earlier run had it, to the last bit as it was learnt.
     fn known(&self, key: &Key) -> Option<Vec<f64>>;
     /// Takes a result for a later run.
     fn learn(&self, key: Key, values: &[f64]);

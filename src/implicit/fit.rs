@@ -182,8 +182,8 @@ fn packed(solution: &Solution, drawn: &[Coefficients]) -> Vec<f64> {
     out
 }
 
-/// The reverse of [`packed`], for `n` constraints. A list that is too short, which nobody makes, gives zeros, and the residuals
-/// that follow refuse them.
+/// The reverse of [`packed`], for `n` constraints. Whoever keeps lists answers for
+/// their being whole ([`exec::Recall`]).
 fn unpacked(list: &[f64], n: usize, draws: usize) -> (Solution, Vec<Coefficients>) {
     let mut rest = list.iter().copied();
     let mut take = |count: usize| -> Vec<f64> { (0..count).map(|_| rest.next().unwrap_or(0.0)).collect() };
