@@ -398,6 +398,19 @@ mod tests {
     }
 
     #[test]
+    fn a_local_cut_past_which_the_wall_runs_on_is_refused_with_the_place() {
+        let ctx = Ctx::new(2).unwrap();
+        let field = fields::tree(vec![(V3::Z, 24.0, 3.0), (-V3::Z, 24.0, 3.0)], vec![1e-6]);
+        let mesh = wall(&field, fields::tips()[0], 0.5, &ctx);
+        // half-way along a tube of radius 3: the ball of 5 mm ends on its wall, 4 mm past the plane
+        let middle = CutPlane::new(P3::new(0.0, 0.0, 5.0), V3::Z).within(5.0);
+        match cut(&mesh, &field, &[middle], &ctx) {
+            Err(Error::CutRunsOn { plane: 0, reach_mm: 5.0, at }) => assert!((at.z() - 9.0).abs() < 1.0, "{at:?}"),
+            other => panic!("{:?}", other.map(|o| o.1)),
+        }
+    }
+
+    #[test]
     fn ids_follow_the_place_and_not_the_order_of_the_planes() {
         let ctx = Ctx::new(2).unwrap();
         let field = fields::anastomosis();
