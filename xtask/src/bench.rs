@@ -24,13 +24,11 @@ pub(crate) enum What {
 /// Thin the same volumes with our code, gaara and scikit-image, interleaved, and show medians and ratios.
 pub(crate) fn thinning(repeat: usize) -> Result<()> {
     ensure!(repeat > 0, "at least one repetition");
-    let mut build = shell::command("cargo");
-    build.args(["build", "--release", "--package", "skeleton", "--example", "thinning"]);
-    shell::run(build)?;
+    let ours = tools::release_example("thinning")?;
     let work = tools::target()?.join("bench-thinning");
     let mut bench = shell::command(tools::thinning_peers()?);
     bench.arg(shell::root()?.join("tests/bench/thinning.py"));
-    bench.arg(tools::target()?.join("release/examples/thinning")).arg(&work).arg(repeat.to_string());
+    bench.arg(ours).arg(&work).arg(repeat.to_string());
     shell::run(bench)
 }
 
@@ -47,8 +45,8 @@ pub(crate) fn service(binary: &Path) -> Result<()> {
 pub(crate) fn surface() -> Result<()> {
     let work = tools::target()?.join("bench-surface");
     fs::create_dir_all(&work)?;
-    let mut ours = shell::command("cargo");
-    ours.args(["run", "--release", "-q", "-p", "surface", "--example", "survey", "--", "0", "0"]).arg(&work);
+    let mut ours = shell::command(tools::release_example("survey")?);
+    ours.args(["0", "0"]).arg(&work);
     shell::run(ours)?;
     let python = tools::python()?;
     let mut pip = shell::command(&python);

@@ -30,12 +30,13 @@ pub(crate) fn all() -> Result<()> {
         .env("VASCULUM_POSTGRES", "required")
         .env("VASCULUM_S3S", tools::s3()?);
     shell::run(test)?;
-    let binary = tools::release_binary()?;
+    tools::release(&["survey", "storm"])?;
+    let binary = tools::built_binary()?;
     let work = fresh_folder()?;
     judges(&binary, &work)?;
     survey::run(&binary, 1, SEEDS)?;
     drawn::run(&binary, 1, DRAWN)?;
-    storm::short()?;
+    storm::short(&tools::built_example("storm")?)?;
     fs::remove_dir_all(&work)?;
     eprintln!("xtask: all checks passed");
     Ok(())
@@ -71,7 +72,7 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(&plan).arg("--out").arg(&out);
     shell::run(run)?;
     let surfaces = work.join("surfaces");
-    surfaces::meshes(&surfaces, SURFACES, 0)?;
+    surfaces::meshes(&tools::built_example("survey")?, &surfaces, SURFACES, 0)?;
     surfaces::volumes(&surfaces, FILLED)?;
     let python = tools::volume_judges()?;
     tools::deploy()?;

@@ -14,7 +14,8 @@ const ADDRESS_SPACE_KIB: u64 = 640 << 10;
 /// kept in the target folder.
 pub(crate) fn run(minutes: f64, seed: u64) -> Result<()> {
     let mut build = shell::command("cargo");
-    build.args(["build", "--package", "artefact", "--example", "fuzz"]);
+    // over the whole workspace, as the tests are built: the dependencies keep their features
+    build.args(["build", "--workspace", "--example", "fuzz"]);
     shell::run(build)?;
     let folder = tools::target()?.join("fuzz");
     fs::create_dir_all(&folder)?;

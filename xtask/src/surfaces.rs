@@ -6,10 +6,9 @@ use std::fs;
 use std::path::Path;
 
 /// Mesh `count` random vessels twice each (uniform and by curvature) into a folder; a missed bar is an error.
-pub(crate) fn meshes(folder: &Path, count: u64, first: u64) -> Result<()> {
+pub(crate) fn meshes(program: &Path, folder: &Path, count: u64, first: u64) -> Result<()> {
     fs::create_dir_all(folder)?;
-    let mut survey = shell::command("cargo");
-    survey.args(["run", "--release", "--quiet", "-p", "surface", "--example", "survey", "--"]);
+    let mut survey = shell::command(program);
     survey.args([count.to_string(), first.to_string()]).arg(folder);
     shell::run(survey)
 }
@@ -31,7 +30,7 @@ pub(crate) fn run(count: u64, first: u64) -> Result<()> {
     if folder.exists() {
         fs::remove_dir_all(&folder)?;
     }
-    meshes(&folder, count, first)?;
+    meshes(&tools::release_example("survey")?, &folder, count, first)?;
     let mut judge = shell::command(tools::python()?);
     judge.arg(shell::root()?.join("tests/python/test_surfaces.py")).env("SURFACES", &folder);
     shell::run(judge)?;

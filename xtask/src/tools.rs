@@ -51,12 +51,39 @@ const NODE_PACKAGES: &[&str] = &[
 
 /// Build the release binary (with the portal) and give its path.
 pub(crate) fn release_binary() -> Result<PathBuf> {
+    release(&[])?;
+    built_binary()
+}
+
+/// Build one of the examples, optimised, and give its path.
+pub(crate) fn release_example(name: &str) -> Result<PathBuf> {
+    release(&[name])?;
+    built_example(name)
+}
+
+/// Build the release binary (with the portal) and these examples.
+///
+/// Always over the whole workspace: cargo unites the features of what it builds together, so that a selection by package
+/// would compile the dependencies again, with other features, and again when the next selection comes.
+pub(crate) fn release(examples: &[&str]) -> Result<()> {
     compiler()?;
     node()?;
     let mut build = shell::command("cargo");
-    build.args(["build", "--release", "--package", "vasculum"]);
-    shell::run(build)?;
+    build.args(["build", "--release", "--workspace", "--bins"]);
+    for example in examples {
+        build.args(["--example", example]);
+    }
+    shell::run(build)
+}
+
+/// Where the release binary lies once it is built.
+pub(crate) fn built_binary() -> Result<PathBuf> {
     Ok(target()?.join("release/vasculum"))
+}
+
+/// Where an example lies once it is built.
+pub(crate) fn built_example(name: &str) -> Result<PathBuf> {
+    Ok(target()?.join("release/examples").join(name))
 }
 
 /// Cargo's target folder.
