@@ -19,7 +19,7 @@ const BEAT: Duration = Duration::from_secs(1);
 /// Shortest time between beats, so that a chatty job cannot keep the writer busy.
 const SHORTEST: Duration = Duration::from_millis(100);
 /// Between looks for leases that ran out and owners that died.
-const RESCUE: Duration = Duration::from_secs(2);
+const RESCUE: Duration = Duration::from_millis(500);
 
 #[derive(Debug)]
 struct Entry {
