@@ -567,19 +567,34 @@ async fn hints_travel_or_are_not_needed(b: Bench) {
 
 async fn the_order_of_claims_does_not_slow_with_the_backlog(b: Bench) {
     let q = &b.queue;
-    let fill = "INSERT INTO job (id, tenant, kind, state, plan, input_digest, input_files, input_bytes, trace_id, rank, \
-        run_at, created_at) WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 30000) \
-        SELECT 'x' || CAST(k AS TEXT), 'default', 'r', 'queued', '{}', 'd', 1, 1, 't', k, 0, 0 FROM n";
-    sql(q, fill).await;
-    if b.config.database_url.is_some() {
-        sql(q, "ANALYZE job").await;
+    macro_rules! fill {
+        ($from:literal, $to:literal) => {
+            concat!(
+                "INSERT INTO job (id, tenant, kind, state, plan, input_digest, input_files, input_bytes, trace_id, rank, \
+                 run_at, created_at) WITH RECURSIVE n(k) AS (SELECT ",
+                $from,
+                " UNION ALL SELECT k + 1 FROM n WHERE k < ",
+                $to,
+                ") SELECT 'x' || CAST(k AS TEXT), 'default', 'r', 'queued', '{}', 'd', 1, 1, 't', k, 0, 0 FROM n"
+            )
+        };
     }
     tenants::set(q.db(), "ward", Some(0), None).await.unwrap();
-    let begun = Instant::now();
-    for k in 1..=30 {
-        assert_eq!(claim(q).await.unwrap().id, format!("x{k}"));
+    let mut quickest = Vec::new();
+    for (from, fill) in [(1, fill!(1, 30)), (31, fill!(31, 100_000))] {
+        sql(q, fill).await;
+        if b.config.database_url.is_some() {
+            sql(q, "ANALYZE job").await;
+        }
+        let mut took = Vec::new();
+        for k in from..from + 30 {
+            let begun = Instant::now();
+            assert_eq!(claim(q).await.unwrap().id, format!("x{k}"));
+            took.push(begun.elapsed());
+        }
+        quickest.extend(took.into_iter().min());
     }
-    let each = begun.elapsed() / 30;
-    // A scan or a sort of 30,000 rows takes 20 ms and more; through the index it is the commit that counts.
-    assert!(each < Duration::from_millis(60), "{each:?} per claim");
+    // Through the index it is the commit that counts; a scan or a sort of 100,000 rows takes 70 ms and more, every time. The
+    // quickest of 30 tells, on a busy machine too.
+    assert!(quickest[1] < 3 * quickest[0] + Duration::from_millis(12), "{quickest:?} per claim");
 }
