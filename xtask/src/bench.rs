@@ -40,7 +40,7 @@ pub(crate) fn fit(repeat: usize) -> Result<()> {
     let built = tools::target()?.join("bench-fit");
     let mut build = shell::command("cargo");
     // the peer asks for a newer compiler than ours, and compiles with ours
-    build.args(["build", "--release", "--locked", "--ignore-rust-version", "--manifest-path"]);
+    build.args(["build", "--release", "--ignore-rust-version", "--manifest-path"]);
     build.arg(shell::root()?.join("tests/bench/fit/Cargo.toml")).env("CARGO_TARGET_DIR", &built);
     shell::run(build)?;
     let mut bench = shell::command(tools::python()?);
