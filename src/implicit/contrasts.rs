@@ -8,8 +8,9 @@
 
 use crate::Error;
 use crate::nearest::{Search, Tree, distance2, farthest_first};
+use crate::wide::{LANES, Wide, apart, fold, widest};
 use exec::Ctx;
-use pulp::Arch;
+use pulp::{Simd, WithSimd};
 
 /// Neighbours per point; with the point itself and padding the local systems have [`ROOM`] rows.
 const NEIGHBOURS: usize = 60;
@@ -127,19 +128,7 @@ impl Local {
         let m = self.member.len();
         let mut g = [0.0; ROOM];
         g[m - 1] = 1.0;
-        Arch::new().dispatch(|| {
-            self.fill(points, noise);
-            for k in 0..4 {
-                two_sided(&mut self.a, &self.v[k], self.tau[k], m);
-                reflect(&self.v[k], self.tau[k], &mut g);
-            }
-            g[..4].fill(0.0);
-            factor_and_solve(&mut self.a, &mut g, m)?;
-            for k in (0..4).rev() {
-                reflect(&self.v[k], self.tau[k], &mut g);
-            }
-            Ok::<(), usize>(())
-        })?;
+        widest(Prediction { local: self, points, noise, g: &mut g })?;
         // g_i of the projector's inverse has the weight of its own point as its squared norm
         let own = g[m - 1];
         if own.is_nan() || own <= 0.0 {
@@ -187,98 +176,144 @@ impl Local {
             self.tau[k] = if vv > 0.0 { 2.0 / vv } else { 0.0 };
             self.v[k] = v;
             for column in p.iter_mut().skip(k) {
-                reflect(&v, self.tau[k], column);
+                widest(Reflection { v: &v, tau: self.tau[k], y: column });
             }
             least = least.min(norm);
         }
         least / (m as f64).sqrt()
     }
+}
 
-    /// K + D of the members, all of it.
+/// The error of the prediction of a point from its neighbours: g = (Q2'(K + D)Q2)^-1 e within the null space of P'.
+struct Prediction<'a> {
+    local: &'a mut Local,
+    points: &'a [[f64; 3]],
+    noise: &'a [f64],
+    /// e, the point itself; then g.
+    g: &'a mut [f64; ROOM],
+}
+
+impl WithSimd for Prediction<'_> {
+    type Output = Result<(), usize>;
+
     #[inline(always)]
-    fn fill(&mut self, points: &[[f64; 3]], noise: &[f64]) {
-        let mut x = [[0.0; ROOM]; 3];
-        for (row, &j) in self.member.iter().enumerate() {
-            for a in 0..3 {
-                x[a][row] = points[j as usize][a];
-            }
+    fn with_simd<S: Simd>(self, simd: S) -> Result<(), usize> {
+        let Self { local, points, noise, g } = self;
+        let m = local.member.len();
+        fill(simd, local, points, noise);
+        for (v, tau) in local.v.iter().zip(local.tau) {
+            two_sided(simd, &mut local.a, v, tau, m);
+            reflect(simd, v, tau, g);
         }
-        for (column, &j) in self.member.iter().enumerate() {
-            let t = points[j as usize];
-            let out = &mut self.a[column];
-            for l in 0..ROOM {
-                let d = [x[0][l] - t[0], x[1][l] - t[1], x[2][l] - t[2]];
-                let r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-                out[l] = r2 * r2.sqrt();
-            }
-            out[column] += noise[j as usize];
-            out[self.member.len()..].fill(0.0);
+        g[..4].fill(0.0);
+        factor_and_solve(simd, &mut local.a, g, m)?;
+        for (v, tau) in local.v.iter().zip(local.tau).rev() {
+            reflect(simd, v, tau, g);
         }
+        Ok(())
+    }
+}
+
+/// Vectors of a local column.
+const fn parts<S: Simd>() -> usize {
+    ROOM / S::F64_LANES
+}
+
+/// K + D of the members, all of it.
+#[inline(always)]
+fn fill<S: Simd>(simd: S, local: &mut Local, points: &[[f64; 3]], noise: &[f64]) {
+    let mut x = [[0.0; ROOM]; 3];
+    for (row, &j) in local.member.iter().enumerate() {
+        for a in 0..3 {
+            x[a][row] = points[j as usize][a];
+        }
+    }
+    for (column, &j) in local.member.iter().enumerate() {
+        let t = points[j as usize].map(|t| Wide::splat(simd, t));
+        let out = &mut local.a[column];
+        for part in 0..parts::<S>() {
+            let (_, r2) = apart(t, [&x[0], &x[1], &x[2]], part);
+            (r2 * r2.sqrt()).put(out, part);
+        }
+        out[column] += noise[j as usize];
+        out[local.member.len()..].fill(0.0);
+    }
+}
+
+/// [`reflect`] on its own.
+struct Reflection<'a> {
+    v: &'a [f64; ROOM],
+    tau: f64,
+    y: &'a mut [f64; ROOM],
+}
+
+impl WithSimd for Reflection<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        reflect(simd, self.v, self.tau, self.y);
     }
 }
 
 #[inline(always)]
-fn reflect(v: &[f64; ROOM], tau: f64, y: &mut [f64; ROOM]) {
-    let s = tau * inner(v, y);
-    for l in 0..ROOM {
-        y[l] -= s * v[l];
+fn reflect<S: Simd>(simd: S, v: &[f64; ROOM], tau: f64, y: &mut [f64; ROOM]) {
+    let s = Wide::splat(simd, tau * inner(simd, v, y));
+    for part in 0..parts::<S>() {
+        (Wide::of(simd, y, part) - s * Wide::of(simd, v, part)).put(y, part);
     }
 }
 
 /// Inner product in eight independent accumulators.
 #[inline(always)]
-fn inner(a: &[f64; ROOM], b: &[f64; ROOM]) -> f64 {
-    let mut acc = [0.0; 8];
-    for (x, y) in a.chunks_exact(8).zip(b.chunks_exact(8)) {
-        for l in 0..8 {
-            acc[l] += x[l] * y[l];
+fn inner<S: Simd>(simd: S, a: &[f64; ROOM], b: &[f64; ROOM]) -> f64 {
+    let mut out = [0.0; LANES];
+    for part in 0..Wide::<S>::PARTS {
+        let mut acc = Wide::splat(simd, 0.0);
+        for at in (part..parts::<S>()).step_by(Wide::<S>::PARTS) {
+            acc += Wide::of(simd, a, at) * Wide::of(simd, b, at);
         }
+        acc.put(&mut out, part);
     }
-    crate::kernel::fold(acc)
+    fold(out)
 }
+
+/// Vectors of a column whose sums stay in registers together.
+const BLOCK: usize = 4;
 
 /// A -> H A H on the leading m columns.
 #[inline(always)]
-fn two_sided(a: &mut [[f64; ROOM]], v: &[f64; ROOM], tau: f64, m: usize) {
+fn two_sided<S: Simd>(simd: S, a: &mut [[f64; ROOM]], v: &[f64; ROOM], tau: f64, m: usize) {
     let mut w = [0.0; ROOM];
-    for j in 0..m {
-        for l in 0..ROOM {
-            w[l] += v[j] * a[j][l];
+    for block in (0..parts::<S>()).step_by(BLOCK) {
+        let mut sums = [Wide::splat(simd, 0.0); BLOCK];
+        for (column, v) in a[..m].iter().zip(v) {
+            let v = Wide::splat(simd, *v);
+            (0..BLOCK).for_each(|k| sums[k] += v * Wide::of(simd, column, block + k));
         }
+        (0..BLOCK).for_each(|k| sums[k].put(&mut w, block + k));
     }
     w.iter_mut().for_each(|w| *w *= tau);
-    let half = 0.5 * tau * inner(v, &w);
+    let half = 0.5 * tau * inner(simd, v, &w);
     for l in 0..ROOM {
         w[l] -= half * v[l];
     }
-    for j in 0..m {
-        for l in 0..ROOM {
-            a[j][l] -= v[l] * w[j] + w[l] * v[j];
+    for (column, (vj, wj)) in a[..m].iter_mut().zip(v.iter().zip(w)) {
+        let (vj, wj) = (Wide::splat(simd, *vj), Wide::splat(simd, wj));
+        for part in 0..parts::<S>() {
+            let step = Wide::of(simd, v, part) * wj + Wide::of(simd, &w, part) * vj;
+            (Wide::of(simd, column, part) - step).put(column, part);
         }
     }
 }
 
 /// Cholesky of rows and columns 4..m (lower triangle), then u -> A^-1 u on the same rows.
 #[inline(always)]
-fn factor_and_solve(a: &mut [[f64; ROOM]], u: &mut [f64; ROOM], m: usize) -> Result<(), usize> {
+fn factor_and_solve<S: Simd>(simd: S, a: &mut [[f64; ROOM]], u: &mut [f64; ROOM], m: usize) -> Result<(), usize> {
     for j in 4..m {
         let (done, rest) = a.split_at_mut(j);
         let column = &mut rest[0];
-        let from = j / 8 * 8;
-        // four columns at once: one pass over the target
-        let mut before = done[4..].chunks_exact(4);
-        for four in before.by_ref() {
-            let f = [four[0][j], four[1][j], four[2][j], four[3][j]];
-            for l in from..ROOM {
-                column[l] -= (f[0] * four[0][l] + f[1] * four[1][l]) + (f[2] * four[2][l] + f[3] * four[3][l]);
-            }
-        }
-        for one in before.remainder() {
-            let f = one[j];
-            for l in from..ROOM {
-                column[l] -= f * one[l];
-            }
-        }
+        let from = subtract(simd, &done[4..], column, j);
         let pivot = column[j];
         if pivot.is_nan() || pivot <= 0.0 {
             return Err(j);
@@ -299,4 +334,28 @@ fn factor_and_solve(a: &mut [[f64; ROOM]], u: &mut [f64; ROOM], m: usize) -> Res
         u[j] = (u[j] - below) / a[j][j];
     }
     Ok(())
+}
+
+/// Takes the columns before column j from it, four at once, in the rows after those that it gives; some of them lie
+/// above the diagonal.
+#[inline(always)]
+fn subtract<S: Simd>(simd: S, before: &[[f64; ROOM]], column: &mut [f64; ROOM], j: usize) -> usize {
+    let (fours, ones) = before.as_chunks::<4>();
+    let first = j / S::F64_LANES / BLOCK * BLOCK;
+    for block in (first..parts::<S>()).step_by(BLOCK) {
+        let mut left: [Wide<S>; BLOCK] = std::array::from_fn(|k| Wide::of(simd, column, block + k));
+        for four in fours {
+            let f = four.each_ref().map(|column| Wide::splat(simd, column[j]));
+            for (k, left) in left.iter_mut().enumerate() {
+                let of = |c: usize| f[c] * Wide::of(simd, &four[c], block + k);
+                *left -= (of(0) + of(1)) + (of(2) + of(3));
+            }
+        }
+        for one in ones {
+            let f = Wide::splat(simd, one[j]);
+            (0..BLOCK).for_each(|k| left[k] -= f * Wide::of(simd, one, block + k));
+        }
+        (0..BLOCK).for_each(|k| left[k].put(column, block + k));
+    }
+    first * S::F64_LANES
 }

@@ -11,8 +11,9 @@
 //! the same bits for any number of threads, but not for the same target in other company.
 
 use crate::kernel::Centres;
+use crate::wide::{Wide, widest};
 use exec::{Cancelled, Ctx};
-use pulp::Arch;
+use pulp::{Simd, WithSimd};
 use std::sync::Arc;
 
 /// Sources at least this many half-edges away from a box are interpolated in it, and the targets of a box that is not
@@ -168,12 +169,7 @@ impl<const P: usize> Tree<'_, P> {
         let targets: Vec<[f64; 3]> = part.targets.iter().map(|&t| self.targets[t as usize]).collect();
         let mut out = direct(&self.sources.some(&part.near), &targets);
         if let Some(far) = &part.far {
-            let nodes = &self.nodes;
-            Arch::new().dispatch(|| {
-                for (o, t) in out.iter_mut().zip(&targets) {
-                    *o += far.value(nodes, *t);
-                }
-            });
+            widest(Interpolated { far, nodes: &self.nodes, targets: &targets, out: &mut out });
         }
         out
     }
@@ -189,7 +185,7 @@ impl<const P: usize> Tree<'_, P> {
         let points: Vec<[f64; 3]> = at[2].iter().flat_map(|&z| plane(z)).collect();
         let sums = direct(&self.sources.some(far), &points);
         let mut values = match parent {
-            Some(parent) => Arch::new().dispatch(|| parent.on_lattice(&self.nodes, &at)),
+            Some(parent) => widest(OnLattice { parent, nodes: &self.nodes, at: &at }),
             None => vec![[0.0; P]; P * P],
         };
         values.iter_mut().flatten().zip(sums).for_each(|(v, s)| *v += s);
@@ -233,35 +229,66 @@ struct Expansion<const P: usize> {
 }
 
 impl<const P: usize> Expansion<P> {
+    /// The function at one target.
     #[inline(always)]
-    fn value(&self, nodes: &Nodes<P>, t: [f64; 3]) -> f64 {
+    fn value<S: Simd>(&self, simd: S, nodes: &Nodes<P>, t: [f64; 3]) -> f64 {
         let [x, y, z] = [0, 1, 2].map(|a| nodes.basis((t[a] - self.centre[a]) / self.half[a]));
         let mut sum = [0.0; P];
         for (plane, wz) in self.values.chunks_exact(P).zip(&z) {
             let mut line = [0.0; P];
             for (row, wy) in plane.iter().zip(&y) {
-                add(&mut line, row, *wy);
+                add(simd, &mut line, row, *wy);
             }
-            add(&mut sum, &line, *wz);
+            add(simd, &mut sum, &line, *wz);
         }
         inner(&sum, &x)
     }
+}
 
-    /// Values at all (x, y, z) of three lists of coordinates, axis by axis, in lines along x.
+/// Adds the function at some targets to what is known there.
+struct Interpolated<'a, const P: usize> {
+    far: &'a Expansion<P>,
+    nodes: &'a Nodes<P>,
+    targets: &'a [[f64; 3]],
+    out: &'a mut [f64],
+}
+
+impl<const P: usize> WithSimd for Interpolated<'_, P> {
+    type Output = ();
+
     #[inline(always)]
-    fn on_lattice(&self, nodes: &Nodes<P>, at: &[[f64; P]; 3]) -> Vec<[f64; P]> {
-        let [x, y, z] = [0, 1, 2].map(|a| at[a].map(|t| nodes.basis((t - self.centre[a]) / self.half[a])));
+    fn with_simd<S: Simd>(self, simd: S) {
+        for (o, t) in self.out.iter_mut().zip(self.targets) {
+            *o += self.far.value(simd, self.nodes, *t);
+        }
+    }
+}
+
+/// Values at all (x, y, z) of three lists of coordinates, axis by axis, in lines along x.
+struct OnLattice<'a, const P: usize> {
+    parent: &'a Expansion<P>,
+    nodes: &'a Nodes<P>,
+    at: &'a [[f64; P]; 3],
+}
+
+impl<const P: usize> WithSimd for OnLattice<'_, P> {
+    type Output = Vec<[f64; P]>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<[f64; P]> {
+        let Self { parent, nodes, at } = self;
+        let [x, y, z] = [0, 1, 2].map(|a| at[a].map(|t| nodes.basis((t - parent.centre[a]) / parent.half[a])));
         let mut by_z = vec![[0.0; P]; P * P];
         for (out, w) in by_z.chunks_exact_mut(P).zip(&z) {
-            for (plane, w) in self.values.chunks_exact(P).zip(w) {
-                out.iter_mut().zip(plane).for_each(|(o, row)| add(o, row, *w));
+            for (plane, w) in parent.values.chunks_exact(P).zip(w) {
+                out.iter_mut().zip(plane).for_each(|(o, row)| add(simd, o, row, *w));
             }
         }
         let mut out = Vec::with_capacity(P * P);
         for plane in by_z.chunks_exact(P) {
             for w in &y {
                 let mut line = [0.0; P];
-                plane.iter().zip(w).for_each(|(row, w)| add(&mut line, row, *w));
+                plane.iter().zip(w).for_each(|(row, w)| add(simd, &mut line, row, *w));
                 out.push(x.map(|w| inner(&line, &w)));
             }
         }
@@ -270,8 +297,13 @@ impl<const P: usize> Expansion<P> {
 }
 
 #[inline(always)]
-fn add<const P: usize>(to: &mut [f64; P], row: &[f64; P], weight: f64) {
-    for m in 0..P {
+fn add<S: Simd, const P: usize>(simd: S, to: &mut [f64; P], row: &[f64; P], weight: f64) {
+    let whole = P / S::F64_LANES;
+    let w = Wide::splat(simd, weight);
+    for part in 0..whole {
+        (Wide::of(simd, to, part) + w * Wide::of(simd, row, part)).put(to, part);
+    }
+    for m in whole * S::F64_LANES..P {
         to[m] += weight * row[m];
     }
 }

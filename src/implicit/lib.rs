@@ -25,6 +25,7 @@ mod system;
 #[cfg(test)]
 mod test_fields;
 mod variational;
+mod wide;
 
 pub use constraints::Constraints;
 pub use ensemble::{Draws, Ensemble};

@@ -4,17 +4,15 @@
 //! with sums of its own that are folded in order, so the bits do not depend on the number of threads. Half the roots of
 //! the plain sum, and the root is what limits both.
 
-use crate::kernel::LANES;
+use crate::wide::{LANES, Lanes, Wide, apart, fold, widest};
 use exec::{Cancelled, Ctx};
-use pulp::Arch;
+use pulp::{Simd, WithSimd};
 
 /// Points per tile: positions, coefficients and sums of one tile are 10 KiB, a third of the first cache.
 const TILE: usize = 256;
 const GROUPS: usize = TILE / LANES;
 /// Tasks, fixed: also the number of partial sums per point (256 bytes per unknown).
 const TASKS: usize = 32;
-
-type Lanes = [f64; LANES];
 
 /// Points and noise, ready for products.
 pub(crate) struct Product {
@@ -52,7 +50,7 @@ impl Product {
             let mine = |row: &usize| [task, 2 * tasks - 1 - task].contains(&(row % (2 * tasks)));
             for row in (0..tiles).filter(mine) {
                 ctx.check()?;
-                Arch::new().dispatch(|| self.tile_row(row, &packed, &mut sums));
+                widest(TileRow { product: self, row, c: &packed, sums: &mut sums });
             }
             Ok(sums)
         })?;
@@ -68,76 +66,83 @@ impl Product {
         }
         Ok(out)
     }
+}
 
-    /// All pairs of a tile with itself and with the tiles after it.
+/// All pairs of a tile with itself and with the tiles after it.
+struct TileRow<'a, const B: usize> {
+    product: &'a Product,
+    row: usize,
+    c: &'a [[Lanes; B]],
+    sums: &'a mut [[Lanes; B]],
+}
+
+impl<const B: usize> WithSimd for TileRow<'_, B> {
+    type Output = ();
+
     #[inline(always)]
-    fn tile_row<const B: usize>(&self, row: usize, c: &[[Lanes; B]], sums: &mut [[Lanes; B]]) {
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { product, row, c, sums } = self;
+        let position = &product.position;
         let own = row * GROUPS;
-        let targets = own * LANES..((own + GROUPS) * LANES).min(self.n);
-        let at = |i: usize| [0, 1, 2].map(|a| self.position[i / LANES][a][i % LANES]);
+        let targets = own * LANES..((own + GROUPS) * LANES).min(product.n);
+        let at = |i: usize| [0, 1, 2].map(|a| Wide::splat(simd, position[i / LANES][a][i % LANES]));
         for i in targets.clone() {
             // within the tile every pair is met from both sides
-            let within = one_sided(&self.position[own..own + GROUPS], at(i), &c[own..own + GROUPS]);
+            let within = one_sided(simd, &position[own..own + GROUPS], at(i), &c[own..own + GROUPS]);
             (0..B).for_each(|b| sums[i / LANES][b][i % LANES] += within[b]);
         }
-        for other in (own + GROUPS..self.position.len()).step_by(GROUPS) {
+        for other in (own + GROUPS..position.len()).step_by(GROUPS) {
             let theirs = other..other + GROUPS;
             for i in targets.clone() {
                 let (g, l) = (i / LANES, i % LANES);
-                let tile = (&self.position[theirs.clone()], &c[theirs.clone()]);
-                let sum = two_sided(tile, at(i), c[g].map(|c| c[l]), &mut sums[theirs.clone()]);
+                let tile = (&position[theirs.clone()], &c[theirs.clone()]);
+                let sum = two_sided(simd, tile, at(i), c[g].map(|c| c[l]), &mut sums[theirs.clone()]);
                 (0..B).for_each(|b| sums[g][b][l] += sum[b]);
             }
         }
     }
 }
 
-/// r^3 from a point to a group.
-#[inline(always)]
-fn cubes([x, y, z]: &[Lanes; 3], t: [f64; 3]) -> Lanes {
-    let mut out = [0.0; LANES];
-    for l in 0..LANES {
-        let d = [t[0] - x[l], t[1] - y[l], t[2] - z[l]];
-        let r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-        out[l] = r2 * r2.sqrt();
-    }
-    out
-}
-
 /// sum c_j r_j^3 over a few groups.
 #[inline(always)]
-fn one_sided<const B: usize>(position: &[[Lanes; 3]], t: [f64; 3], c: &[[Lanes; B]]) -> [f64; B] {
-    let mut acc = [[0.0; LANES]; B];
-    for (group, c) in position.iter().zip(c) {
-        let cube = cubes(group, t);
-        for (acc, c) in acc.iter_mut().zip(c) {
-            (0..LANES).for_each(|l| acc[l] += c[l] * cube[l]);
+fn one_sided<S: Simd, const B: usize>(simd: S, position: &[[Lanes; 3]], t: [Wide<S>; 3], c: &[[Lanes; B]]) -> [f64; B] {
+    let mut out = [[0.0; LANES]; B];
+    for part in 0..Wide::<S>::PARTS {
+        let mut acc = [Wide::splat(simd, 0.0); B];
+        for (group, c) in position.iter().zip(c) {
+            let (_, r2) = apart(t, [&group[0], &group[1], &group[2]], part);
+            let cube = r2 * r2.sqrt();
+            (0..B).for_each(|b| acc[b] += Wide::of(simd, &c[b], part) * cube);
         }
+        (0..B).for_each(|b| acc[b].put(&mut out[b], part));
     }
-    acc.map(crate::kernel::fold)
+    out.map(fold)
 }
 
 /// The same, which also adds own r_j^3 to every `sums` j.
 #[inline(always)]
-fn two_sided<const B: usize>(
+fn two_sided<S: Simd, const B: usize>(
+    simd: S,
     (position, c): (&[[Lanes; 3]], &[[Lanes; B]]),
-    t: [f64; 3],
+    t: [Wide<S>; 3],
     own: [f64; B],
     sums: &mut [[Lanes; B]],
 ) -> [f64; B] {
-    let mut acc = [[0.0; LANES]; B];
-    for ((group, c), sums) in position.iter().zip(c).zip(sums) {
-        let cube = cubes(group, t);
-        for b in 0..B {
-            let (mut a, mut s) = (acc[b], sums[b]);
-            for l in 0..LANES {
-                a[l] += c[b][l] * cube[l];
-                s[l] += own[b] * cube[l];
+    let own = own.map(|own| Wide::splat(simd, own));
+    let mut out = [[0.0; LANES]; B];
+    for part in 0..Wide::<S>::PARTS {
+        let mut acc = [Wide::splat(simd, 0.0); B];
+        for ((group, c), sums) in position.iter().zip(c).zip(&mut *sums) {
+            let (_, r2) = apart(t, [&group[0], &group[1], &group[2]], part);
+            let cube = r2 * r2.sqrt();
+            for b in 0..B {
+                acc[b] += Wide::of(simd, &c[b], part) * cube;
+                (Wide::of(simd, &sums[b], part) + own[b] * cube).put(&mut sums[b], part);
             }
-            (acc[b], sums[b]) = (a, s);
         }
+        (0..B).for_each(|b| acc[b].put(&mut out[b], part));
     }
-    acc.map(crate::kernel::fold)
+    out.map(fold)
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage; thinning beside others.
+//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage; the fit, thinning and meshes beside others.
 
 use crate::{shell, tools};
 use anyhow::{Context, Result, ensure};
@@ -13,6 +13,8 @@ pub(crate) enum What {
     Whole,
     /// Thinning beside gaara and scikit-image on the same volumes.
     Thinning,
+    /// The implicit fit beside ferreus_rbf and scipy, and the sums beside the machine's rate of square roots.
+    Fit,
     /// The remeshing of the benchmark anastomosis beside other programs on the same surface.
     Surface,
     /// GET of a job by wrk, and the memory of 50 uploads of 120 MB at the same time.
@@ -29,6 +31,21 @@ pub(crate) fn thinning(repeat: usize) -> Result<()> {
     let mut bench = shell::command(tools::thinning_peers()?);
     bench.arg(shell::root()?.join("tests/bench/thinning.py"));
     bench.arg(ours).arg(&work).arg(repeat.to_string());
+    shell::run(bench)
+}
+
+/// Fits of the same constraints by our code and its peers, each a process of its own, and the rates of the sums.
+pub(crate) fn fit(repeat: usize) -> Result<()> {
+    ensure!(repeat > 0, "at least one repetition");
+    let built = tools::target()?.join("bench-fit");
+    let mut build = shell::command("cargo");
+    // the peer asks for a newer compiler than ours, and compiles with ours
+    build.args(["build", "--release", "--ignore-rust-version", "--manifest-path"]);
+    build.arg(shell::root()?.join("tests/bench/fit/Cargo.toml")).env("CARGO_TARGET_DIR", &built);
+    shell::run(build)?;
+    let mut bench = shell::command(tools::python()?);
+    bench.arg(shell::root()?.join("tests/bench/fit.py"));
+    bench.arg(built.join("release")).arg(built.join("work")).arg(repeat.to_string());
     shell::run(bench)
 }
 

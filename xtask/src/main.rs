@@ -101,6 +101,7 @@ fn run(command: Command) -> Result<()> {
         Command::Survey { count: Some(count), first, .. } => drawn::run(&tools::release_binary()?, first, count),
         Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
+        Command::Bench { what: bench::What::Fit, repeat, .. } => bench::fit(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
         Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
         Command::Bench { what: bench::What::Service, .. } => bench::service(&tools::release_binary()?),
