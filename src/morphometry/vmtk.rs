@@ -6,7 +6,8 @@
 //! nothing else in the result leans on them. The steps are those of VMTK's vtkvmtkCenterlineBranchExtractor,
 //! -BifurcationReferenceSystems and -BifurcationVectors, read in its source and written anew: on the same lines VMTK 1.5.2
 //! has the same angles (tests below). Its normal of four points out of a plane weights their corners; the area's normal
-//! (Newell) was up to .7 degrees from it on a scan. VMTK before 1.5 turns that normal by an error in its indices.
+//! (Newell) was up to .7 degrees from it on a scan. The lines are led through the junction as VMTK leads its own (path.rs);
+//! what is left of a difference is where they part, to which the vectors are sensitive (docs/accuracy.md).
 
 use crate::line::nearest;
 use crate::types::VmtkAngles;
@@ -81,10 +82,10 @@ impl Centreline {
         }
     }
 
-    /// Just outside of where the line leaves another's canal surface, at segment `from` or later.
-    fn leaves(&self, other: &Self, from: usize) -> Option<At> {
+    /// Just outside of where the line leaves another's canal surface.
+    fn leaves(&self, other: &Self) -> Option<At> {
         let value = |ball: Ball| other.tube(ball.centre);
-        let k = (from..self.0.len() - 1).find(|&k| value(self.0[k]) <= 0.0 && value(self.0[k + 1]) > 0.0)?;
+        let k = (0..self.0.len() - 1).find(|&k| value(self.0[k]) <= 0.0 && value(self.0[k + 1]) > 0.0)?;
         let border = self.root(k, value);
         Some(self.beyond(border, OUTSIDE_RADII * self.ball(border).radius))
     }
@@ -100,20 +101,27 @@ impl Centreline {
 }
 
 /// In-plane and out-of-plane angles of each leg's bifurcation vector, degrees, in the legs' order. `lines` run from the
-/// junction outward and share their first ball; `inlet` is a leg. `None` where a leg is shorter than a sphere.
-pub(crate) fn vmtk_angles(lines: &[Vec<Ball>], inlet: usize, inlet_branch: usize) -> Option<VmtkAngles> {
+/// junction outward and share their first ball; `inlet` is a leg; `led` leads a line from the inlet to an outlet as VMTK would.
+/// `None` where a leg is shorter than a sphere.
+pub(crate) fn vmtk_angles(
+    lines: &[Vec<Ball>],
+    inlet: usize,
+    inlet_branch: usize,
+    led: impl Fn(Vec<Ball>) -> Vec<Ball>,
+) -> Option<VmtkAngles> {
     if lines.iter().any(|l| l.len() < 2) {
         return None;
     }
     let outlets: Vec<usize> = (0..lines.len()).filter(|&l| l != inlet).collect();
     let upstream = || lines[inlet].iter().rev().copied();
-    let centrelines: Vec<Centreline> =
-        outlets.iter().map(|&o| Centreline(upstream().chain(lines[o].iter().skip(1).copied()).collect())).collect();
-    let node = lines[inlet].len() - 1;
+    let centrelines: Vec<Centreline> = outlets
+        .iter()
+        .map(|&o| Centreline(led(upstream().chain(lines[o].iter().skip(1).copied()).collect())))
+        .collect();
     let mut tracts = Vec::new();
     for (i, line) in centrelines.iter().enumerate() {
         let others = centrelines.iter().enumerate().filter(|&(j, _)| j != i);
-        let exits: Vec<At> = others.map(|(_, other)| line.leaves(other, node)).collect::<Option<_>>()?;
+        let exits: Vec<At> = others.map(|(_, other)| line.leaves(other)).collect::<Option<_>>()?;
         let exit = exits.into_iter().max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)))?;
         tracts.push((line.touching(exit, true)?, exit));
     }
@@ -215,7 +223,7 @@ mod tests {
         let (s, c) = 30.0f64.to_radians().sin_cos();
         let lines =
             [straight(-DVec3::Z, 3.0), straight(DVec3::new(s, 0.0, c), 3.0), straight(DVec3::new(-s, 0.0, c), 3.0)];
-        let angles = vmtk_angles(&lines, 0, 7).unwrap();
+        let angles = vmtk_angles(&lines, 0, 7, |l| l).unwrap();
         assert_eq!(angles.inlet, 7);
         assert!(angles.in_plane_deg[0].abs() < 1e-9, "{angles:?}");
         assert!((angles.in_plane_deg[1] + angles.in_plane_deg[2]).abs() < 1e-9, "{angles:?}");
@@ -244,7 +252,7 @@ mod tests {
         let in_plane = [[8.67, 44.38, -24.33], [37.10, 71.72, -80.83], [7.49, 41.85, -91.14]];
         let out_of_plane = [[16.30, -10.17, 17.66], [-26.99, 4.47, -14.42], [24.26, -2.78, -10.70]];
         for inlet in 0..3 {
-            let angles = vmtk_angles(&legs, inlet, inlet).unwrap();
+            let angles = vmtk_angles(&legs, inlet, inlet, |l| l).unwrap();
             let order: Vec<usize> = std::iter::once(inlet).chain((0..3).filter(|&l| l != inlet)).collect();
             for (k, &leg) in order.iter().enumerate() {
                 let off = [
@@ -260,7 +268,7 @@ mod tests {
     fn a_leg_shorter_than_a_sphere_has_no_angles() {
         let mut lines = [straight(-DVec3::Z, 3.0), straight(DVec3::X, 3.0), straight(DVec3::Z, 3.0)];
         lines[1].truncate(8);
-        assert!(vmtk_angles(&lines, 0, 0).is_none());
+        assert!(vmtk_angles(&lines, 0, 0, |l| l).is_none());
     }
 
     #[test]
@@ -271,7 +279,7 @@ mod tests {
             straight(DVec3::new(1.0, 0.0, 1.0), 3.0),
             straight(DVec3::new(-tilt.cos(), tilt.sin(), 1.0), 3.0),
         ];
-        let angles = vmtk_angles(&lines, 0, 0).unwrap();
+        let angles = vmtk_angles(&lines, 0, 0, |l| l).unwrap();
         let [a, b] = [angles.out_of_plane_deg[1], angles.out_of_plane_deg[2]];
         assert!(a.abs() < 12.0 && b.abs() < 12.0, "the plane is that of both outlets: {angles:?}");
         assert!(angles.out_of_plane_deg[0].abs() > 1.0, "{angles:?}");
