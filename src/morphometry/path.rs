@@ -108,14 +108,14 @@ fn descend(x: &mut [DVec3], wall: &[DVec3], step: f64, sharpness: f64) {
     let seen: Vec<(f64, DVec3)> = x.iter().map(|&p| distance(p, wall, sharpness)).collect();
     let cost = |k: usize| 1.0 / seen[k].0.max(1e-3);
     let old = x.to_vec();
-    for k in 1..old.len() - 1 {
+    for (k, point) in x.iter_mut().enumerate().take(old.len() - 1).skip(1) {
         let (before, after) = (old[k] - old[k - 1], old[k + 1] - old[k]);
         let (lengths, directions) =
             ((before.length(), after.length()), (before.normalize_or_zero(), after.normalize_or_zero()));
         let shorter = directions.0 * (0.5 * (cost(k - 1) + cost(k))) - directions.1 * (0.5 * (cost(k) + cost(k + 1)));
         let wider = -seen[k].1 * (cost(k).powi(2) * 0.5 * (lengths.0 + lengths.1));
         let gradient = (shorter + wider).reject_from(old[k + 1] - old[k - 1]);
-        x[k] -= (gradient * (RATE * step / cost(k))).clamp_length_max(LONGEST * step);
+        *point -= (gradient * (RATE * step / cost(k))).clamp_length_max(LONGEST * step);
     }
 }
 

@@ -251,14 +251,11 @@ mod tests {
         // The inlet first, then the outlets in the legs' order; VMTK's last step ends .02 mm before ours here.
         let in_plane = [[8.67, 44.38, -24.33], [37.10, 71.72, -80.83], [7.49, 41.85, -91.14]];
         let out_of_plane = [[16.30, -10.17, 17.66], [-26.99, 4.47, -14.42], [24.26, -2.78, -10.70]];
-        for inlet in 0..3 {
+        for (inlet, (in_plane, out_of_plane)) in in_plane.iter().zip(&out_of_plane).enumerate() {
             let angles = vmtk_angles(&legs, inlet, inlet, |l| l).unwrap();
             let order: Vec<usize> = std::iter::once(inlet).chain((0..3).filter(|&l| l != inlet)).collect();
             for (k, &leg) in order.iter().enumerate() {
-                let off = [
-                    angles.in_plane_deg[leg] - in_plane[inlet][k],
-                    angles.out_of_plane_deg[leg] - out_of_plane[inlet][k],
-                ];
+                let off = [angles.in_plane_deg[leg] - in_plane[k], angles.out_of_plane_deg[leg] - out_of_plane[k]];
                 assert!(off.iter().all(|o| o.abs() < 1.0), "inlet {inlet} leg {leg}: {off:?}");
             }
         }
