@@ -12,6 +12,7 @@ mod junction;
 mod line;
 mod linear;
 mod measure;
+mod path;
 mod resynthesis;
 mod roles;
 mod section;

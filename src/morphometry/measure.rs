@@ -9,6 +9,7 @@ use crate::junction::{
     Axes, FROM_CROTCH, Leg, LegPoint, Ruler, WINDOW_MIN, axes, chord, fit_window, flag, leg_line, leg_radius, legs_at,
 };
 use crate::linear::median;
+use crate::path;
 use crate::roles::{Scope, Sites, assign};
 use crate::section::Lumen;
 use crate::track::{Track, curvature, finish, tracks};
@@ -118,6 +119,7 @@ pub fn measure_with_bands(
             roles: &roles[j],
             diameter: diameters[j],
             varied: varied.as_ref(),
+            lumen,
         };
         junctions.push(site.junction(settings, &mut warnings));
     }
@@ -249,6 +251,7 @@ struct Site<'a> {
     roles: &'a [Role],
     diameter: f64,
     varied: Option<&'a Varied>,
+    lumen: Lumen<'a>,
 }
 
 impl Site<'_> {
@@ -306,7 +309,10 @@ impl Site<'_> {
         let ball = |p: LegPoint| Ball { centre: p.point, radius: p.radius };
         let line = |&leg: &Leg| leg_line(self.tracks, leg).into_iter().map(ball).collect();
         let lines: Vec<Vec<Ball>> = self.place.legs.iter().map(line).collect();
-        vmtk_angles(&lines, inlet, self.tracks[self.place.legs[inlet].track].id)
+        let size = radius(&self.place.legs[inlet]);
+        let (centre, wall) = (self.place.position.raw(), path::wall(&lines, self.lumen, size));
+        let led = |line| path::least(line, centre, self.lumen, &wall, size);
+        vmtk_angles(&lines, inlet, self.tracks[self.place.legs[inlet].track].id, led)
     }
 
     /// The window that all legs of an angle have data in, graft diameters.

@@ -131,6 +131,19 @@ impl Lumen<'_> {
         best
     }
 
+    /// Where rays from a centre in these directions meet the wall; those that do not are left out.
+    pub(crate) fn wall_about(&self, centre: P3, radius_mm: f64, directions: &[DVec3]) -> Vec<DVec3> {
+        let f = self.field.value(centre);
+        if !positive(f) || !positive(radius_mm) {
+            return Vec::new();
+        }
+        let met = |&along: &DVec3| match self.wall(centre.raw(), along, f, radius_mm) {
+            Hit::Wall { r, .. } => Some(centre.raw() + along * r),
+            Hit::Open | Hit::Far => None,
+        };
+        directions.iter().filter_map(met).collect()
+    }
+
     /// Length of a ray until the data end; with a zero direction: 0 outside the data, infinite inside.
     fn exit(&self, from: DVec3, direction: DVec3) -> f64 {
         let bounds = self.field.bounds();

@@ -1,4 +1,5 @@
-//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage; the fit, thinning and meshes beside others.
+//! `cargo xtask bench`: wall time, CPU time and memory of the whole reconstruction, stage by stage; single stages and the
+//! whole beside others.
 
 use crate::{shell, tools};
 use anyhow::{Context, Result, ensure};
@@ -17,6 +18,8 @@ pub(crate) enum What {
     Fit,
     /// The remeshing of the benchmark anastomosis beside other programs on the same surface.
     Surface,
+    /// Angles, areas, radii and centrelines beside VMTK's on the same scans, with both chains' times stage by stage.
+    Accuracy,
     /// GET of a job by wrk, and the memory of 50 uploads of 120 MB at the same time.
     Service,
     /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued.
@@ -46,6 +49,17 @@ pub(crate) fn fit(repeat: usize) -> Result<()> {
     let mut bench = shell::command(tools::python()?);
     bench.arg(shell::root()?.join("tests/bench/fit.py"));
     bench.arg(built.join("release")).arg(built.join("work")).arg(repeat.to_string());
+    shell::run(bench)
+}
+
+/// Ours and VMTK on the same simulated scans against the exact truth, `seeds` of each resolution, interleaved.
+pub(crate) fn accuracy(seeds: usize) -> Result<()> {
+    ensure!(seeds > 0, "at least one seed");
+    let python = tools::vmtk()?;
+    let ours = tools::release_binary()?;
+    let mut bench = shell::command(python);
+    bench.arg(shell::root()?.join("tests/bench/accuracy.py"));
+    bench.arg(ours).arg(tools::target()?.join("bench-accuracy")).arg(seeds.to_string());
     shell::run(bench)
 }
 

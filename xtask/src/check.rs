@@ -75,6 +75,10 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
     surfaces::meshes(&tools::built_example("survey")?, &surfaces, SURFACES, 0)?;
     surfaces::volumes(&surfaces, FILLED)?;
     let python = tools::volume_judges()?;
+    // The benches need programs of their own; here only that they can be read.
+    let mut benches = shell::command(&python);
+    benches.args(["-m", "compileall", "-q", "tests/bench"]);
+    shell::run(benches)?;
     tools::deploy()?;
     tools::pacs()?;
     tools::strace()?;

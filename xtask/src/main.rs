@@ -73,7 +73,7 @@ enum Command {
         /// What is measured.
         #[arg(value_enum, default_value_t = bench::What::Whole)]
         what: bench::What,
-        /// Repetitions; the medians are shown.
+        /// Repetitions (of `accuracy`: seeds of each resolution); the medians are shown.
         #[arg(long, default_value_t = 5)]
         repeat: usize,
         /// Jobs queued in the large case of `queue`.
@@ -104,6 +104,7 @@ fn run(command: Command) -> Result<()> {
         Command::Bench { what: bench::What::Fit, repeat, .. } => bench::fit(repeat),
         Command::Fuzz { minutes, seed } => fuzz::run(minutes, seed),
         Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
+        Command::Bench { what: bench::What::Accuracy, repeat, .. } => bench::accuracy(repeat),
         Command::Bench { what: bench::What::Service, .. } => bench::service(&tools::release_binary()?),
         Command::Bench { what: bench::What::Queue, large, .. } => storm::bench(large),
         Command::Storm { kills, jobs, seed } => storm::run(kills, jobs, seed),

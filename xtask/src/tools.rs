@@ -5,7 +5,7 @@
 use crate::shell;
 use anyhow::{Context, Result, bail};
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Programs that judge our files; versions are pinned so that a green run stays green.
 const PYTHON_PACKAGES: &[&str] = &[
@@ -38,6 +38,10 @@ const PYTHON_PACKAGES: &[&str] = &[
 ];
 /// Programs that `cargo xtask bench thinning` runs beside ours; only measured against, never linked.
 const THINNING_PACKAGES: &[&str] = &["numpy", "gaara==0.11.0", "scikit-image==0.26.0"];
+/// VMTK, measured against on the same scans, and the reader of the scans.
+const VMTK_PACKAGES: &[&str] = &["vmtk==1.5.2", "numpy", "nibabel==5.4.2"];
+/// The oldest Python that VMTK's package is made for.
+const VMTK_PYTHON: [u32; 2] = [3, 12];
 const NODE_PACKAGES: &[&str] = &[
     "gltf-validator@2.0.0-dev.3.10",
     "playwright-core@1.65.1",
@@ -230,7 +234,7 @@ pub(crate) fn python() -> Result<PathBuf> {
     if !shell::has("python3") || !python_has_venv() {
         apt("Python with venv (programs that judge our files)", &["python3", "python3-venv"])?;
     }
-    environment("venv", PYTHON_PACKAGES)
+    environment("python3".as_ref(), "venv", PYTHON_PACKAGES)
 }
 
 /// Python with the peers of thinning; the path of its interpreter.
@@ -238,11 +242,48 @@ pub(crate) fn thinning_peers() -> Result<PathBuf> {
     if !shell::has("python3") || !python_has_venv() {
         apt("Python with venv (programs to measure against)", &["python3", "python3-venv"])?;
     }
-    environment("venv-thinning", THINNING_PACKAGES)
+    environment("python3".as_ref(), "venv-thinning", THINNING_PACKAGES)
 }
 
-/// A virtual environment with these packages; the path of its interpreter.
-fn environment(name: &str, packages: &[&str]) -> Result<PathBuf> {
+/// Python with VMTK; the path of its interpreter.
+///
+/// # Errors
+/// Where no Python of 3.12 or later is found: Debian 12 has none, so that none is installed from here.
+pub(crate) fn vmtk() -> Result<PathBuf> {
+    let [major, minor] = VMTK_PYTHON;
+    let python = python_since(major, minor).with_context(|| {
+        format!(
+            "VMTK needs Python >= {major}.{minor} with venv: no python3 on PATH and none of pyenv's versions \
+             ($PYENV_ROOT, ~/.pyenv) is one; install it, for instance by `pyenv install {major}.{minor}`"
+        )
+    })?;
+    environment(&python, "venv-vmtk", VMTK_PACKAGES)
+}
+
+/// An interpreter of this version or later that can make environments: on PATH, or among pyenv's versions.
+fn python_since(major: u32, minor: u32) -> Option<PathBuf> {
+    let wanted = format!("import sys, venv, ensurepip; sys.exit(sys.version_info < ({major}, {minor}))");
+    let on_path =
+        std::iter::once("python3".into()).chain((minor..minor + 3).map(|m| format!("python{major}.{m}").into()));
+    on_path.chain(pyenv_pythons()).find(|python: &PathBuf| {
+        let mut c = shell::command(python);
+        c.args(["-c", &wanted]);
+        shell::succeeds(c)
+    })
+}
+
+/// The interpreters below pyenv's versions folder, in name order.
+fn pyenv_pythons() -> Vec<PathBuf> {
+    let root = std::env::var_os("PYENV_ROOT").map(PathBuf::from);
+    let root = root.or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".pyenv")));
+    let versions = root.and_then(|root| fs::read_dir(root.join("versions")).ok()).into_iter().flatten().flatten();
+    let mut pythons: Vec<PathBuf> = versions.map(|version| version.path().join("bin/python3")).collect();
+    pythons.sort();
+    pythons
+}
+
+/// A virtual environment of this interpreter with these packages; the path of its own interpreter.
+fn environment(python: &Path, name: &str, packages: &[&str]) -> Result<PathBuf> {
     let venv = folder()?.join(name);
     let interpreter = venv.join("bin/python");
     let wanted = packages.join("\n");
@@ -250,7 +291,7 @@ fn environment(name: &str, packages: &[&str]) -> Result<PathBuf> {
     if fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
         return Ok(interpreter);
     }
-    let mut make = shell::command("python3");
+    let mut make = shell::command(python);
     make.args(["-m", "venv", "--clear"]).arg(&venv);
     shell::run(make)?;
     let mut install = shell::command(&interpreter);
