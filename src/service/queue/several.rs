@@ -49,7 +49,12 @@ impl Queue {
 async fn accepted(tx: &mut Tx<'_>, jobs: Vec<NewJob>) -> sqlx::Result<Together> {
     let key = jobs.first().and_then(|job| job.idempotency_key.clone());
     if let (Some(key), Some(first)) = (&key, jobs.first()) {
-        let found = earlier(tx, &first.tenant, key).await?;
+        let mut found = earlier(tx, &first.tenant, key).await?;
+        if found.first().is_some_and(|(number, _)| *number != 0) {
+            // On PostgreSQL every statement sees what was committed before it: the other request committed between two of ours.
+            // Now all of its jobs are there, but for those that were erased since.
+            found = earlier(tx, &first.tenant, key).await?;
+        }
         let same = found.len() == jobs.len() && jobs.iter().zip(&found).all(|(job, (_, row))| job.is_same(row));
         let in_order = found.iter().enumerate().all(|(k, (number, _))| k == *number);
         if same && in_order {
