@@ -47,7 +47,8 @@ def fitpack(raw, s):
 
 
 def read():
-    command = ["cargo", "run", "--quiet", "-p", "imaging", "--example", "judged"]
+    built = os.environ.get("VASCULUM_JUDGED")
+    command = [built] if built else ["cargo", "run", "--quiet", "-p", "imaging", "--example", "judged"]
     text = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     cases = {}
     for line in text.splitlines():

@@ -94,6 +94,8 @@ fn judges(binary: &Path, work: &Path) -> Result<()> {
             .env("VASCULUM_OUT", &out)
             .env("VASCULUM_SCAN", &scan)
             .env("SURFACES", &surfaces)
+            // built with the tests
+            .env("VASCULUM_JUDGED", tools::target()?.join("debug/examples/judged"))
             .env("VASCULUM_NODE", &node)
             .env("VASCULUM_S3S", tools::s3()?);
         shell::run(judge)?;
