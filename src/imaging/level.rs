@@ -65,6 +65,12 @@ const DEEP: u8 = 30;
 /// 99.9 % of the lumen 2 px from the wall. Some of these voxels lie 1 px inside it, so that levels come out .2 % of the
 /// contrast too high; a ring from 2.5 px is free of that and finds no room between neighbours (docs/adr/0033).
 const RING: (u8, u8) = (20, 42);
+/// The ring from which contours' levels are taken: that one is free of the .2 %. Nearer voxels count where there is nothing else.
+const CLEAR: (u8, u8) = (25, 47);
+/// Two rings that differ by less than this share of the contrast see the same surroundings, and the clear one is right; where they
+/// differ by three times as much, a neighbour's blur fills the gap between two walls, and the level that keeps them apart is that of the
+/// near ring. In slices that mix (the second value) a leaning wall reaches into the near ring by itself.
+const APART: [f32; 2] = [0.01, 0.02];
 /// A voxel of the ring whose height above the surroundings of 10 mm is more than this share of that of the mask's rim beside it is
 /// no surroundings: there is no wall in between, the lumen runs on. Across a wall the share is 0 to .2 (the rim is at
 /// half height or above), ahead of a front in a fading vessel .8 to 1. Without this the aorta of a coil-faded scan
@@ -115,12 +121,31 @@ impl Patch {
         level: impl Fn(usize) -> f32 + Sync,
         ctx: &Ctx,
     ) -> Result<Fields, Error> {
-        let Weights { core, ring } = self.weights(mask, level, ctx)?;
+        let Weights { core, ring } = self.weights(RING, mask, level, ctx)?;
         let raw = |i: usize| self.raw[i];
         let inside = self.spread(|i| core[i], raw, INSIDE_MM, ctx)?;
         let outside = self.spread(|i| ring[i], raw, OUTSIDE_MM, ctx)?;
         let wide = self.spread(|i| core[i], raw, WIDE_MM, ctx)?;
         Ok(Fields { inside, outside, wide })
+    }
+
+    /// The values from which contours are drawn, for a mask that grew under `fields`: the surroundings begin [`CLEAR`] of the wall
+    /// where the nearer ring says about the same ([`APART`]).
+    pub(crate) fn drawing_fields(&self, mask: &[bool], fields: Fields, ctx: &Ctx) -> Result<Fields, Error> {
+        let Weights { ring, .. } = self.weights(CLEAR, mask, |i| fields.level(i), ctx)?;
+        let mut outside = self.spread(|i| ring[i], |i| self.raw[i], OUTSIDE_MM, ctx)?;
+        let apart = if self.mixing() { APART[1] } else { APART[0] };
+        for (i, far) in outside.iter_mut().enumerate() {
+            let near = fields.outside[i];
+            let share = (near - *far).abs() / (apart * fields.contrast(i).max(f32::MIN_POSITIVE));
+            *far += (0.5 * (share - 1.0)).clamp(0.0, 1.0) * (near - *far);
+        }
+        Ok(Fields { outside, ..fields })
+    }
+
+    /// Whether slices mix lumen and surroundings beyond the ring's inner edge.
+    fn mixing(&self) -> bool {
+        self.step[2] > MIXING_PX * self.pixel_mm
     }
 
     /// Standard error of the outside values, by voxel: the noise of a mean over few voxels, N, and the tissue's texture T, which the
@@ -130,7 +155,7 @@ impl Patch {
     /// subtracted: their product has the expectation T + 2 N, since nothing of their own noise is in it (noise is independent
     /// from pixel to pixel; in interpolated images it counts as texture). The two means differ by 4 N in variance.
     pub(crate) fn outside_error(&self, mask: &[bool], fields: &Fields, ctx: &Ctx) -> Result<Vec<f32>, Error> {
-        let Weights { ring, .. } = self.weights(mask, |i| fields.level(i), ctx)?;
+        let Weights { ring, .. } = self.weights(CLEAR, mask, |i| fields.level(i), ctx)?;
         let black = |i: usize| (i % self.n[0] + i / self.n[0]).is_multiple_of(2);
         let field = |i: usize, of: bool| if black(i) == of { ring[i] } else { 0.0 };
         let raw = |i: usize| self.raw[i];
@@ -146,18 +171,24 @@ impl Patch {
         Ok(variance.into_iter().map(|v| v.max(0.0).sqrt()).collect())
     }
 
-    fn weights(&self, mask: &[bool], level: impl Fn(usize) -> f32 + Sync, ctx: &Ctx) -> Result<Weights, Error> {
+    fn weights(
+        &self,
+        band: (u8, u8),
+        mask: &[bool],
+        level: impl Fn(usize) -> f32 + Sync,
+        ctx: &Ctx,
+    ) -> Result<Weights, Error> {
         let filled = filled(mask, self.n, ctx)?;
         let other = (0..mask.len()).map(|i| !filled[i] && self.smooth[i] > level(i)).collect();
         let masks = [filled, mask.iter().map(|m| !m).collect(), other];
-        let limits = [RING.1, DEEP + 5, RING.0];
+        let limits = [band.1, DEEP + 5, RING.0];
         let found = ctx.map_range(3, |k| match k {
             0 => distances_and_sources(&masks[0], self.n, self.tenths(), limits[0]),
             _ => (self.distances(&masks[k], limits[k]), Vec::new()),
         })?;
         let d: Vec<&Vec<u8>> = found.iter().map(|f| &f.0).collect();
         let source = &found[0].1;
-        let in_ring = |i: usize| (RING.0..=RING.1).contains(&d[0][i]) && d[2][i] == FAR;
+        let in_ring = |i: usize| (RING.0..=band.1).contains(&d[0][i]) && d[2][i] == FAR;
         let ground = self.spread(|i| f32::from(u8::from(in_ring(i))), |i| self.raw[i], WIDE_MM, ctx)?;
         let runs_on = |i: usize| self.smooth[i] - ground[i] > RUNS_ON * (self.smooth[source[i] as usize] - ground[i]);
         let depth = |i: usize| match d[1][i] {
@@ -166,7 +197,7 @@ impl Patch {
             // a voxel beside the boundary is half a pixel deep
             t => (f32::from(t.saturating_sub(5).min(DEEP)) / f32::from(DEEP)).powi(3),
         };
-        let mixing = self.step[2] > MIXING_PX * self.pixel_mm;
+        let mixing = self.mixing();
         let within = if mixing {
             distances(&masks[0], self.n, [self.tenths()[0], self.tenths()[1], f64::from(FAR)], RING.0)
         } else {
@@ -176,7 +207,7 @@ impl Patch {
         let partial = |i: usize| mixing && self.neighbours(i).any(|j| !masks[0][j]);
         let ring = |i: usize| match in_ring(i) && !runs_on(i) {
             false => 0.0,
-            true if beside(i) => PARTIAL,
+            true if beside(i) || d[0][i] < band.0 => PARTIAL,
             true => 1.0,
         };
         let core = |i: usize| if partial(i) { PARTIAL * depth(i) } else { depth(i) };

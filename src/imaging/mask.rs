@@ -81,7 +81,8 @@ pub(crate) fn segmentation(stack: &Stack, mask: &Mask, settings: &Settings, ctx:
     // first without, then with the other bright structures left out of the surroundings
     let first = patch.fields(&inside, |_| f32::MAX, ctx)?;
     ctx.progress(0.6);
-    let fields = patch.fields(&inside, |i| first.level(i), ctx)?;
+    let near = patch.fields(&inside, |i| first.level(i), ctx)?;
+    let fields = patch.drawing_fields(&inside, near, ctx)?;
     let outside_error = patch.outside_error(&inside, &fields, ctx)?;
     let contrast: Vec<f32> = (0..inside.len()).map(|i| fields.contrast(i)).collect();
     let level: Vec<f32> = match settings.threshold {

@@ -249,6 +249,7 @@ fn outlined(
             if grown.len() as f64 > LEAK * started as f64 {
                 warnings.push(leak(started, grown.len()));
             }
+            let fields = patch.drawing_fields(&mask, fields, ctx)?;
             let outside_error = patch.outside_error(&mask, &fields, ctx)?;
             return Ok(finished(&patch, settings, &mask, (&fields, outside_error), (raw_noise, warnings)));
         }
