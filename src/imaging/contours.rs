@@ -202,6 +202,7 @@ fn curve(outline: &Outline, fit: &Smoothed, lumen: usize, variance: Option<[f64;
         level: outline.level,
         standard_error_mm: fit.standard_error,
         level_error_mm: 0.0,
+        freedom: fit.freedom,
         border,
         hole: outline.hole,
     }

@@ -68,6 +68,9 @@ pub struct Curve {
     /// Standard error of the position by the level that it was drawn at, mm: noise in the local value of the surroundings,
     /// and tissue that is brighter or darker beside the wall than that. Neighbouring curves share it ([`Contours::LEVEL_MM`]).
     pub level_error_mm: f64,
+    /// Effective degrees of freedom of the smoothing spline: over as many terms, from size and place on, the standard error is
+    /// spread.
+    pub freedom: f64,
     /// Parameter intervals (start, end in arc length, mm, possibly wrapping) that follow the image border and not the
     /// wall: no wall constraint may be taken there.
     pub border: Vec<[f64; 2]>,

@@ -16,6 +16,8 @@ pub(crate) struct Smoothed {
     pub(crate) spline: PeriodicSpline,
     /// Standard error along the normal, mm.
     pub(crate) standard_error: f64,
+    /// Effective degrees of freedom: 3 (size and place) where a circle is all that the data ask for.
+    pub(crate) freedom: f64,
 }
 
 /// Inflation of the degrees of freedom in GCV, usually 1.4 (Gu). Discs of 10 px at SNR 10/20/30 reach .070/.042/.026 px
@@ -50,7 +52,7 @@ pub(crate) fn smoothed(line: &Line) -> Smoothed {
     let (spline, dof) = outcome.unwrap_or_else(|| (PeriodicSpline::through(points), n as f64));
     let rss: f64 = points.iter().zip(&t).map(|(p, t)| normal_offset(p, &spline, t * spline.length()).powi(2)).sum();
     let variance = rss / (n as f64 - dof).max(1.0);
-    Smoothed { spline, standard_error: (SHARED_NOISE * variance * dof / n as f64).sqrt() }
+    Smoothed { spline, standard_error: (SHARED_NOISE * variance * dof / n as f64).sqrt(), freedom: dof }
 }
 
 fn normal_offset(p: &[f64; 2], spline: &PeriodicSpline, s: f64) -> f64 {

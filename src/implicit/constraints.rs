@@ -23,6 +23,8 @@ pub struct Constraints {
     pub sigma_mm: Vec<f64>,
     /// For each wall constraint the error of its contour's level, mm, which neighbours within [`Contours::LEVEL_MM`] share.
     pub level_mm: Vec<f64>,
+    /// For each wall constraint its contour's degrees of freedom.
+    pub freedom: Vec<f64>,
     /// The first `wall` constraints lie on the wall (value 0).
     pub wall: usize,
     /// For each interior constraint (they follow the wall) the wall point it belongs to and its distance, mm.
@@ -54,6 +56,7 @@ struct WallPoint {
     width_mm: f64,
     sigma_mm: f64,
     level_mm: f64,
+    freedom: f64,
     curve: usize,
     planar_shift: Option<V3>,
 }
@@ -67,6 +70,7 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.values.push(0.0);
         c.sigma_mm.push(w.sigma_mm);
         c.level_mm.push(w.level_mm);
+        c.freedom.push(w.freedom);
         c.curve.push(Some(w.curve));
         c.planar_shift.push(w.planar_shift);
     }
@@ -97,6 +101,7 @@ pub(crate) fn spatial(
         values: first.values[..first.wall].to_vec(),
         sigma_mm: first.sigma_mm[..first.wall].to_vec(),
         level_mm: first.level_mm.clone(),
+        freedom: first.freedom.clone(),
         wall: first.wall,
         interior: Vec::new(),
         curve: first.curve.clone(),
@@ -208,6 +213,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
             width_mm: width(plane, &polygons, p.position, p.inward).unwrap_or(2.0 * radius),
             sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
             level_mm: curve.level_error_mm,
+            freedom: curve.freedom,
             curve: number,
             planar_shift: contours.blur.filter(|_| !at_end).map(|b| p.inward * -b.planar_shift_mm(plane, &p)),
         });
@@ -267,6 +273,7 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
         c.values.push(0.0);
         c.sigma_mm.push(0.5 * contours.pixel_mm);
         c.level_mm.push(0.0);
+        c.freedom.push(0.0);
         c.curve.push(None);
         c.planar_shift.push(None);
         c.wall += 1;

@@ -10,7 +10,7 @@
 //! g is a sum of plane waves. |h|^3 has the spectral density 96 pi / k^6 in three dimensions; wave numbers are drawn
 //! log-uniformly from the size of the data to half the spacing of the wall points, each wave weighted by the density.
 //! The errors of a contour are those of its smoothing spline: not independent from point to point but a trigonometric
-//! polynomial along the contour with as many terms as the spline has degrees of freedom ([`CONTOUR_MODES`]). The error of the
+//! polynomial along the contour, over which the spline's degrees of freedom are spread ([`modes`]). The error of the
 //! level at which contours are drawn is a field of its own, which neighbouring contours share.
 
 use crate::Error;
@@ -23,9 +23,8 @@ use exec::Ctx;
 use imaging::Contours;
 use space::P3;
 
-/// Terms of a contour's error: mean, two of position, two of ellipticity, two more. Smoothing splines of discs of 5 to 10
-/// px at SNR 10 to 30 have 4 to 8 degrees of freedom.
-const CONTOUR_MODES: usize = 7;
+/// Highest harmonic of a contour's error: 33 terms in all.
+const HARMONICS: usize = 16;
 /// Plane waves of a draw: some 25 per factor of two in wave number.
 const WAVES: usize = 256;
 /// Plane waves of a draw of the levels' errors.
@@ -185,6 +184,27 @@ fn level_waves(scale: &Scale, normal: &mut Normal) -> Vec<Wave> {
         .collect()
 }
 
+/// Deviations of a contour's error by harmonic (each but the first has two terms), of variance 1 in all: the shares of its noise
+/// that a smoothing spline lets through. Size and place are free, harmonic m passes by 1 / (1 + k m^2 (m^2 - 1)^2) (docs/adr/0033),
+/// with the k at which they sum to the degrees of freedom.
+fn modes(freedom: f64) -> [f64; HARMONICS + 1] {
+    let passed = |k: f64| -> [f64; HARMONICS + 1] {
+        std::array::from_fn(|m| {
+            let m2 = (m * m) as f64;
+            if m < 2 { 1.0 } else { 1.0 / (1.0 + k * m2 * (m2 - 1.0).powi(2)) }
+        })
+    };
+    let sum = |passed: [f64; HARMONICS + 1]| passed.iter().skip(1).fold(passed[0], |s, w| s + 2.0 * w);
+    let (mut low, mut high) = (-40.0_f64, 40.0_f64);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if sum(passed(middle.exp())) > freedom { low = middle } else { high = middle }
+    }
+    let passed = passed(high.exp());
+    let norm = sum(passed.map(|w| w * w)).sqrt();
+    passed.map(|w| if w > 1e-6 { w / norm } else { 0.0 })
+}
+
 /// One draw of the constraints' errors: a trigonometric polynomial along each contour, independent elsewhere.
 fn errors(c: &Constraints, normal: &mut Normal) -> Vec<f64> {
     let mut out = Vec::with_capacity(c.points.len());
@@ -196,15 +216,18 @@ fn errors(c: &Constraints, normal: &mut Normal) -> Vec<f64> {
             continue;
         };
         let count = c.curve[i..c.wall].iter().take_while(|&&other| other == Some(curve)).count();
-        let terms: Vec<f64> = (0..CONTOUR_MODES).map(|_| normal.next()).collect();
+        let sizes = modes(c.freedom[i]);
+        let terms: [[f64; 2]; HARMONICS + 1] = std::array::from_fn(|_| [normal.next(), normal.next()]);
         for k in 0..count {
             let angle = std::f64::consts::TAU * k as f64 / count as f64;
-            let mut error = terms[0];
-            for (m, pair) in terms[1..].chunks(2).enumerate() {
-                let (sin, cos) = ((m + 1) as f64 * angle).sin_cos();
-                error += std::f64::consts::SQRT_2 * (pair[0] * cos + pair.get(1).copied().unwrap_or(0.0) * sin);
+            let mut error = sizes[0] * terms[0][0];
+            for (m, (size, pair)) in
+                sizes.iter().zip(&terms).enumerate().skip(1).take_while(|(_, (size, _))| **size > 0.0)
+            {
+                let (sin, cos) = (m as f64 * angle).sin_cos();
+                error += size * std::f64::consts::SQRT_2 * (pair[0] * cos + pair[1] * sin);
             }
-            out.push(c.sigma_mm[i + k] * error / (CONTOUR_MODES as f64).sqrt());
+            out.push(c.sigma_mm[i + k] * error);
         }
         i += count;
     }
@@ -297,6 +320,7 @@ mod tests {
             interior: Vec::new(),
             planar_shift: vec![None; n / 2],
             level_mm: vec![0.0; n / 2],
+            freedom: vec![7.0; n / 2],
             curve: (0..n / 2).map(|i| Some(i / per_ring)).collect(),
         };
         let ctx = Ctx::new(2).unwrap();
@@ -319,8 +343,8 @@ mod tests {
         println!("24 draws: {:.2} s", start.elapsed().as_secs_f64());
     }
 
-    #[test]
-    fn a_contour_s_errors_have_the_stated_size_and_its_mean_that_of_its_terms() {
+    /// Mean square of a contour's drawn errors, and of their mean along it, over the stated ones.
+    fn drawn(freedom: f64) -> [f64; 2] {
         let mut normal = Normal::new(11);
         let n = 40;
         let c = Constraints {
@@ -331,6 +355,7 @@ mod tests {
             interior: Vec::new(),
             planar_shift: vec![None; n],
             level_mm: vec![0.0; n],
+            freedom: vec![freedom; n],
             curve: vec![Some(0); n],
         };
         let draws = 3000;
@@ -340,8 +365,22 @@ mod tests {
             square += e.iter().map(|x| x * x).sum::<f64>() / n as f64;
             mean += (e.iter().sum::<f64>() / n as f64).powi(2);
         }
-        let (square, mean) = (square / f64::from(draws) / 0.01, mean / f64::from(draws) / 0.01);
-        assert!((square - 1.0).abs() < 0.05, "{square}");
-        assert!((mean * CONTOUR_MODES as f64 - 1.0).abs() < 0.1, "{mean}");
+        [square / f64::from(draws) / 0.01, mean / f64::from(draws) / 0.01]
+    }
+
+    #[test]
+    fn a_contour_s_errors_have_the_stated_size_and_are_spread_over_its_degrees_of_freedom() {
+        // a circle fitted to data that ask for no more errs in size and place alone
+        let [square, mean] = drawn(3.0);
+        assert!((square - 1.0).abs() < 0.05 && (3.0 * mean - 1.0).abs() < 0.1, "{square} {mean}");
+        let [square, mean] = drawn(1e3);
+        assert!((square - 1.0).abs() < 0.05 && (33.0 * mean - 1.0).abs() < 0.1, "{square} {mean}");
+        for freedom in [3.5, 7.0, 12.0, 20.0] {
+            let sizes = modes(freedom);
+            let passed = sizes.map(|size| size / sizes[0]);
+            let sum = passed[1..].iter().fold(passed[0], |s, w| s + 2.0 * w);
+            assert!((sum - freedom).abs() < 1e-3, "{sum} for {freedom}");
+            assert!(sizes.windows(2).all(|w| w[1] <= w[0]));
+        }
     }
 }

@@ -51,6 +51,7 @@ fn section(frame: &Frame, (number, z): (usize, f64), wider: f64) -> (Plane, Curv
         level: 0.0,
         standard_error_mm: 0.02 * frame.unit,
         level_error_mm: 0.0,
+        freedom: 7.0,
         border: Vec::new(),
         hole: false,
     };

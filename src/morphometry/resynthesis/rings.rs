@@ -19,6 +19,8 @@ const SPACING_RADII: f64 = 0.4;
 const BLEND_RADII: f64 = 0.1;
 /// Standard error of the curves, in pixels: the sections are those of a smooth function, not of pixels.
 const ERROR_PX: f64 = 0.01;
+/// Their degrees of freedom: size, place, and the next two harmonics.
+const RING_FREEDOM: f64 = 7.0;
 /// A cut reaches this many pixels past the longest ray of its section, or as far as the next vessel's wall allows.
 const CUT_REACH_PX: f64 = 6.0;
 /// So many pixels past its plane are meshed before they are cut away: the least that a cut must reach.
@@ -334,6 +336,7 @@ fn push_ring(ring: &Ring, keep: &[bool], out: &mut Contours) {
         level: 0.0,
         standard_error_mm: ERROR_PX * out.pixel_mm,
         level_error_mm: 0.0,
+        freedom: RING_FREEDOM,
         border,
         hole: false,
     });
