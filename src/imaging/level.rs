@@ -470,6 +470,42 @@ mod tests {
         (Patch { low: [0; 3], n, step: [0.5, 0.5, 1.5], pixel_mm: 0.5, smooth: raw.clone(), raw }, mask, tissue)
     }
 
+    /// Vertical tubes of 6 px about (x, 24.2) in tissue of 230, lumens of 1000, blurred by .6 px (a logistic edge); the mask of the first.
+    fn blurred_tubes(x: &[f64]) -> (Patch, Vec<bool>) {
+        let n = [64, 48, 12];
+        let off = |i: usize, x: f64| ((i % 64) as f64 - x).hypot((i / 64 % 48) as f64 - 24.2) - 6.0;
+        let edge = |d: f64| 1.0 / (1.0 + (1.702 * d / 0.6).exp());
+        let value = |i: usize| 230.0 + 770.0 * x.iter().map(|&x| edge(off(i, x))).sum::<f64>();
+        let raw: Vec<f32> = (0..64 * 48 * 12).map(|i| value(i) as f32).collect();
+        let mask = (0..raw.len()).map(|i| off(i, x[0]) < 0.0).collect();
+        (Patch { low: [0; 3], n, step: [0.5, 0.5, 0.5], pixel_mm: 0.5, smooth: raw.clone(), raw }, mask)
+    }
+
+    #[test]
+    fn levels_of_drawing_are_clear_of_the_blur_and_keep_to_the_gap_between_two_walls() {
+        let ctx = Ctx::new(1).unwrap();
+        let mean = |f: &Fields, of: &[usize]| of.iter().map(|&i| f.outside[i]).sum::<f32>() / of.len() as f32;
+        let beside = |patch: &Patch, mask: &[bool]| -> Vec<usize> {
+            let near = patch.distances(mask, 10);
+            (0..mask.len()).filter(|&i| !mask[i] && near[i] <= 10).collect()
+        };
+        let (patch, mask) = blurred_tubes(&[20.0]);
+        let near = patch.fields(&mask, |_| 615.0, &ctx).unwrap();
+        let rim = beside(&patch, &mask);
+        let of_ring = mean(&near, &rim);
+        let drawn = mean(&patch.drawing_fields(&mask, near, &ctx).unwrap(), &rim);
+        assert!(of_ring > 230.0 + 0.002 * 770.0 && (drawn - 230.0).abs() < 0.001 * 770.0, "{of_ring} {drawn}");
+
+        // 4.5 px from wall to wall: what the gap shows is neither wall's surroundings, and keeps them apart
+        let (patch, mask) = blurred_tubes(&[20.0, 36.5]);
+        let near = patch.fields(&mask, |_| 615.0, &ctx).unwrap();
+        let gap: Vec<usize> =
+            beside(&patch, &mask).into_iter().filter(|i| i % 64 > 25 && (22..27).contains(&(i / 64 % 48))).collect();
+        let of_ring = mean(&near, &gap);
+        let drawn = mean(&patch.drawing_fields(&mask, near, &ctx).unwrap(), &gap);
+        assert!(of_ring > 230.0 + 0.03 * 770.0 && drawn > of_ring - 0.002 * 770.0, "{of_ring} {drawn}");
+    }
+
     /// Mean squares over the voxels beside the tube: tissue less its local mean, and the error stated for it.
     fn squares(amplitude: f32) -> [f64; 2] {
         let ctx = Ctx::new(1).unwrap();

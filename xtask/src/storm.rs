@@ -1,10 +1,13 @@
 //! `cargo xtask storm` and `cargo xtask bench queue`: the queue under `kill -9`, and its speed.
 
 use crate::{shell, tools};
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use std::path::Path;
+use std::process::Command;
 
-/// Kills of the short storm in the test command: about three minutes over both databases.
+const DATABASES: [&str; 2] = ["sqlite", "postgres"];
+
+/// Kills of the short storm in the test command, on each database.
 const SHORT: [&str; 6] = ["--kills", "120", "--jobs", "1500", "--minutes", "3"];
 
 /// The whole storm on both databases (bars: 1,000 kills over 20,000 jobs on each).
@@ -14,9 +17,14 @@ pub(crate) fn run(kills: usize, jobs: usize, seed: u64) -> Result<()> {
     each(&program, &["--kills", &kills, "--jobs", &jobs, "--seed", &seed], true)
 }
 
-/// The short storm.
+/// The short storm, on both databases at the same time: it waits more than it works.
 pub(crate) fn short(program: &Path) -> Result<()> {
-    each(program, &SHORT, true)
+    tools::postgres()?;
+    std::thread::scope(|scope| {
+        let storms =
+            DATABASES.map(|database| scope.spawn(move || shell::run(command(program, database, &SHORT, true))));
+        storms.into_iter().try_for_each(|storm| storm.join().unwrap_or_else(|_| Err(anyhow!("a storm panicked"))))
+    })
 }
 
 /// The queue's speed on both databases.
@@ -26,13 +34,14 @@ pub(crate) fn bench(large: u64) -> Result<()> {
 
 fn each(program: &Path, arguments: &[&str], is_storm: bool) -> Result<()> {
     tools::postgres()?;
-    for database in ["sqlite", "postgres"] {
-        let mut run = shell::command(program);
-        if is_storm {
-            run.arg("run");
-        }
-        run.arg(database).args(arguments);
-        shell::run(run)?;
+    DATABASES.iter().try_for_each(|database| shell::run(command(program, database, arguments, is_storm)))
+}
+
+fn command(program: &Path, database: &str, arguments: &[&str], is_storm: bool) -> Command {
+    let mut run = shell::command(program);
+    if is_storm {
+        run.arg("run");
     }
-    Ok(())
+    run.arg(database).args(arguments);
+    run
 }
