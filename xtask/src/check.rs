@@ -1,9 +1,10 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
 use crate::{drawn, shell, storm, surfaces, survey, tools};
-use anyhow::{Result, bail};
+use anyhow::{Result, anyhow, bail};
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::process::Command;
 
 /// Noise seeds of the demo scan that the test command reconstructs (the survey runs ten).
 const SEEDS: u64 = 3;
@@ -31,15 +32,27 @@ pub(crate) fn all() -> Result<()> {
         .env("VASCULUM_S3S", tools::s3()?);
     shell::run(test)?;
     tools::release(&["survey", "storm"])?;
-    let binary = tools::built_binary()?;
-    let work = fresh_folder()?;
-    judges(&binary, &work)?;
-    survey::run(&binary, 1, SEEDS)?;
-    drawn::run(&binary, 1, DRAWN)?;
-    storm::short(&tools::built_example("storm")?)?;
-    fs::remove_dir_all(&work)?;
+    let judged = judged()?;
+    together(
+        || judges(&judged).and_then(|()| storm::short(&tools::built_example("storm")?)),
+        || {
+            portal(&judged)?;
+            survey::run(&judged.binary, 1, SEEDS)?;
+            drawn::run(&judged.binary, 1, DRAWN)
+        },
+    )?;
+    fs::remove_dir_all(&judged.work)?;
     eprintln!("xtask: all checks passed");
     Ok(())
+}
+
+/// Both at the same time: they start services and browsers, and wait for them more than they work.
+fn together(one: impl FnOnce() -> Result<()> + Send, other: impl FnOnce() -> Result<()> + Send) -> Result<()> {
+    std::thread::scope(|scope| {
+        let one = scope.spawn(one);
+        let other = other().inspect_err(|e| eprintln!("xtask: {e:#}"));
+        one.join().unwrap_or_else(|_| Err(anyhow!("a check panicked"))).and(other)
+    })
 }
 
 fn lint() -> Result<()> {
@@ -49,6 +62,43 @@ fn lint() -> Result<()> {
     let mut clippy = shell::command("cargo");
     clippy.args(["clippy", "--workspace", "--all-targets", "--quiet", "--", "-D", "warnings"]);
     shell::run(clippy)
+}
+
+/// What the judges get: the program, and one scan with its result.
+struct Judged {
+    binary: PathBuf,
+    work: PathBuf,
+    scan: PathBuf,
+    out: PathBuf,
+    surfaces: PathBuf,
+    python: PathBuf,
+    node: PathBuf,
+}
+
+/// Make what is judged, and install who judges it.
+fn judged() -> Result<Judged> {
+    let (binary, work) = (tools::built_binary()?, fresh_folder()?);
+    let (scan, out) = (work.join("scan"), work.join("out"));
+    let mut phantom = shell::command(&binary);
+    phantom.args(["phantom", "anastomosis", "--seed", "1", "--out"]).arg(&scan);
+    shell::run(phantom)?;
+    let plan = work.join("plan.json");
+    fs::write(&plan, with_patches(&fs::read(scan.join("plan.json"))?)?)?;
+    let mut run = shell::command(&binary);
+    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(&plan).arg("--out").arg(&out);
+    shell::run(run)?;
+    let surfaces = work.join("surfaces");
+    surfaces::meshes(&tools::built_example("survey")?, &surfaces, SURFACES, 0)?;
+    surfaces::volumes(&surfaces, FILLED)?;
+    let python = tools::volume_judges()?;
+    tools::deploy()?;
+    tools::pacs()?;
+    tools::strace()?;
+    tools::groff()?;
+    tools::jq()?;
+    tools::browser()?;
+    let node = tools::node_packages()?;
+    Ok(Judged { binary, work, scan, out, surfaces, python, node })
 }
 
 fn fresh_folder() -> Result<PathBuf> {
@@ -61,56 +111,42 @@ fn fresh_folder() -> Result<PathBuf> {
 }
 
 /// Programs that we did not write read what we write.
-fn judges(binary: &Path, work: &Path) -> Result<()> {
-    let (scan, out) = (work.join("scan"), work.join("out"));
-    let mut phantom = shell::command(binary);
-    phantom.args(["phantom", "anastomosis", "--seed", "1", "--out"]).arg(&scan);
-    shell::run(phantom)?;
-    let plan = work.join("plan.json");
-    fs::write(&plan, with_patches(&fs::read(scan.join("plan.json"))?)?)?;
-    let mut run = shell::command(binary);
-    run.arg("run").arg(scan.join("dicom")).arg("--plan").arg(&plan).arg("--out").arg(&out);
-    shell::run(run)?;
-    let surfaces = work.join("surfaces");
-    surfaces::meshes(&tools::built_example("survey")?, &surfaces, SURFACES, 0)?;
-    surfaces::volumes(&surfaces, FILLED)?;
-    let python = tools::volume_judges()?;
+fn judges(judged: &Judged) -> Result<()> {
     // The benches need programs of their own; here only that they can be read.
-    let mut benches = shell::command(&python);
+    let mut benches = shell::command(&judged.python);
     benches.args(["-m", "compileall", "-q", "tests/bench"]);
     shell::run(benches)?;
-    tools::deploy()?;
-    tools::pacs()?;
-    tools::strace()?;
-    tools::groff()?;
-    tools::jq()?;
-    let node = tools::node_packages()?;
     for script in scripts("tests/python", "py")? {
-        let mut judge = shell::command(&python);
+        let mut judge = shell::command(&judged.python);
         judge
             .arg(script)
             .env("VASCULUM_ROOT", shell::root()?)
-            .env("VASCULUM_BIN", binary)
-            .env("VASCULUM_OUT", &out)
-            .env("VASCULUM_SCAN", &scan)
-            .env("SURFACES", &surfaces)
+            .env("SURFACES", &judged.surfaces)
             // built with the tests
             .env("VASCULUM_JUDGED", tools::target()?.join("debug/examples/judged"))
-            .env("VASCULUM_NODE", &node)
+            .env("VASCULUM_NODE", &judged.node)
             .env("VASCULUM_S3S", tools::s3()?);
-        shell::run(judge)?;
-    }
-    tools::browser()?;
-    for script in scripts("tests/js", "mjs")? {
-        // modules resolve packages from their own folder: run a copy beside node_modules
-        let copy = node.join(script.file_name().unwrap_or_default());
-        fs::copy(&script, &copy)?;
-        let mut judge = shell::command("node");
-        judge.arg(&copy).env("VASCULUM_BIN", binary).env("VASCULUM_OUT", &out).env("VASCULUM_SCAN", &scan);
-        judge.env("VASCULUM_WORK", work);
-        shell::run(judge)?;
+        judge_one(judge, judged)?;
     }
     Ok(())
+}
+
+/// The portal and the files for browsers, in a browser.
+fn portal(judged: &Judged) -> Result<()> {
+    for script in scripts("tests/js", "mjs")? {
+        // modules resolve packages from their own folder: run a copy beside node_modules
+        let copy = judged.node.join(script.file_name().unwrap_or_default());
+        fs::copy(&script, &copy)?;
+        let mut judge = shell::command("node");
+        judge.arg(&copy).env("VASCULUM_WORK", &judged.work);
+        judge_one(judge, judged)?;
+    }
+    Ok(())
+}
+
+fn judge_one(mut judge: Command, judged: &Judged) -> Result<()> {
+    judge.env("VASCULUM_BIN", &judged.binary).env("VASCULUM_OUT", &judged.out).env("VASCULUM_SCAN", &judged.scan);
+    shell::run_whole(judge)
 }
 
 /// The same plan, asking for patches too.

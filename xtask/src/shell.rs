@@ -2,8 +2,9 @@
 
 use anyhow::{Context, Result, bail};
 use std::ffi::OsStr;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 
 /// Commands that take this long tell it: the test command's time is a bar of its own.
 const SLOW_S: u64 = 10;
@@ -26,14 +27,29 @@ pub(crate) fn command(program: impl AsRef<OsStr>) -> Command {
 /// Show and run; an exit code other than 0 is an error.
 pub(crate) fn run(mut command: Command) -> Result<()> {
     eprintln!("+ {}", words(&command));
+    timed(&mut command, |command| command.status())
+}
+
+/// Show and run, and show what it wrote when it has ended: for commands that run beside others.
+pub(crate) fn run_whole(mut command: Command) -> Result<()> {
+    eprintln!("+ {}", words(&command));
+    timed(&mut command, |command| {
+        let output = command.stdin(Stdio::null()).output()?;
+        let written = [output.stdout, output.stderr].concat();
+        io::stderr().write_all(&[format!("- {}\n", words(command)).as_bytes(), &written].concat())?;
+        Ok(output.status)
+    })
+}
+
+fn timed(command: &mut Command, run: impl FnOnce(&mut Command) -> io::Result<ExitStatus>) -> Result<()> {
     let started = std::time::Instant::now();
-    let status = command.status().with_context(|| format!("cannot start {}", words(&command)))?;
+    let status = run(command).with_context(|| format!("cannot run {}", words(command)))?;
     let took = started.elapsed().as_secs();
     if took >= SLOW_S {
-        eprintln!("xtask: that took {took} s");
+        eprintln!("xtask: that took {took} s ({})", words(command));
     }
     if !status.success() {
-        bail!("{} ended with {status}", words(&command));
+        bail!("{} ended with {status}", words(command));
     }
     Ok(())
 }
