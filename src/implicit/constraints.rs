@@ -34,6 +34,8 @@ pub struct Constraints {
     /// For each wall constraint how far its contour was moved by the planar half-maximum correction, mm outward in the
     /// plane; `None` where no other correction may take its place (tips, end planes, no known blur).
     pub planar_shift: Vec<Option<V3>>,
+    /// For each wall constraint how far it lies from where its contour was drawn, mm: the half-maximum correction.
+    pub correction_mm: Vec<f64>,
 }
 
 /// Fewest wall points per curve: a cubic radial basis needs about this many to carry an ellipse.
@@ -73,6 +75,7 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.freedom.push(w.freedom);
         c.curve.push(Some(w.curve));
         c.planar_shift.push(w.planar_shift);
+        c.correction_mm.push(w.planar_shift.map_or(0.0, V3::length));
     }
     push_tips(contours, &mut c);
     for (i, w) in wall.iter().enumerate() {
@@ -96,7 +99,9 @@ pub(crate) fn spatial(
     normal: impl Fn(P3) -> Option<V3>,
     inside: impl Fn(P3) -> bool,
 ) -> Constraints {
+    let from_drawn = |(i, x): (usize, &P3)| first.planar_shift[i].map_or(0.0, |s| x.distance(first.points[i] - s));
     let mut c = Constraints {
+        correction_mm: wall.iter().enumerate().map(from_drawn).collect(),
         points: wall,
         values: first.values[..first.wall].to_vec(),
         sigma_mm: first.sigma_mm[..first.wall].to_vec(),
@@ -140,8 +145,10 @@ fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
     let finest = settings.step * contours.pixel_mm.max(0.5 * plane_spacing_mm(contours));
     // one interior point per wall point, and room for tips and closing points
     let room = settings.max_constraints.saturating_sub(64 + 2 * contours.tips.len()) / 2;
+    let counted = Counted::of(contours);
     let (mut step, mut stride) = (finest, 1);
-    while kept(contours, stride).map(|(_, c)| count_on(c, step)).sum::<usize>() > room {
+    let at = |c: &Curve| counted.number(c.plane);
+    while counted.kept(contours, stride).map(|(_, c)| count_on(c, step)).sum::<usize>() > room {
         step *= 1.05;
         // beyond that planes are left out instead: their points interleave, so the step along the vessel may grow too
         if step > COARSEST * finest {
@@ -151,16 +158,37 @@ fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
             break;
         }
     }
-    kept(contours, stride).flat_map(|(i, c)| points_on(contours, i, c, step)).collect()
+    // what samples the constraints later on (roughness) goes by their order
+    let mut kept: Vec<(usize, &Curve)> = counted.kept(contours, stride).collect();
+    kept.sort_by_key(|(_, c)| at(c));
+    kept.into_iter().flat_map(|(i, c)| points_on(contours, (i, at(c)), c, step)).collect()
 }
 
 /// Growth of the step between wall points of a contour before planes are left out.
 const COARSEST: f64 = 2.5;
 
-/// The curves of every `stride`-th plane, and of the first and the last.
-fn kept(contours: &Contours, stride: usize) -> impl Iterator<Item = (usize, &Curve)> {
-    let last = contours.planes.len().saturating_sub(1);
-    contours.curves.iter().enumerate().filter(move |(_, c)| c.plane % stride == 0 || c.plane == last)
+/// Planes counted from the end with more wall, so that slices in the other order give the same points.
+struct Counted {
+    last: usize,
+    from_last: bool,
+}
+
+impl Counted {
+    fn of(contours: &Contours) -> Self {
+        let last = contours.planes.len().saturating_sub(1);
+        let turn = |c: &Curve| c.length_mm() * (2.0 * c.plane as f64 - last as f64);
+        Self { last, from_last: contours.curves.iter().map(turn).sum::<f64>() > 0.0 }
+    }
+
+    fn number(&self, plane: usize) -> usize {
+        if self.from_last { self.last - plane } else { plane }
+    }
+
+    /// The curves of every `stride`-th plane, and of the first and the last.
+    fn kept<'c>(&self, contours: &'c Contours, stride: usize) -> impl Iterator<Item = (usize, &'c Curve)> {
+        let is_kept = move |number: usize| number.is_multiple_of(stride) || number == self.last;
+        contours.curves.iter().enumerate().filter(move |(_, c)| is_kept(self.number(c.plane)))
+    }
 }
 
 fn plane_spacing_mm(contours: &Contours) -> f64 {
@@ -176,7 +204,9 @@ fn count_on(curve: &Curve, step: f64) -> usize {
 
 /// Points of one curve, denser where it bends: density = (1 + |kappa| R) / 2 with R = length / 2 pi, so that a circle
 /// is sampled evenly.
-fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Vec<WallPoint> {
+///
+/// `number` is that of the curve and that of its plane as [`Counted`].
+fn points_on(contours: &Contours, number: (usize, usize), curve: &Curve, step: f64) -> Vec<WallPoint> {
     let plane = &contours.planes[curve.plane];
     let length = curve.length_mm();
     let fine = 4 * count_on(curve, step).max(32);
@@ -189,7 +219,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
     }
     let total = cumulative[fine];
     let count = count_on(curve, step);
-    let phase = (GOLDEN * curve.plane as f64).fract();
+    let phase = (GOLDEN * number.1 as f64).fract();
     let polygons = polygons(contours, curve.plane);
     // at the end planes the first function already closes: its bend along the vessel is not the wall's
     let at_end = contours.cuts.iter().any(|cut| {
@@ -214,7 +244,7 @@ fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64) -> Ve
             sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
             level_mm: curve.level_error_mm,
             freedom: curve.freedom,
-            curve: number,
+            curve: number.0,
             planar_shift: contours.blur.filter(|_| !at_end).map(|b| p.inward * -b.planar_shift_mm(plane, &p)),
         });
     }
@@ -276,6 +306,7 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
         c.freedom.push(0.0);
         c.curve.push(None);
         c.planar_shift.push(None);
+        c.correction_mm.push(0.0);
         c.wall += 1;
     }
 }

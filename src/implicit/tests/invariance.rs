@@ -124,12 +124,13 @@ fn a_fit_moves_with_the_scan_and_with_its_unit() {
 
 #[test]
 fn slices_from_the_other_end_give_the_same_wall() {
-    // wall points interleave from the first plane on, so that they are other points of the same curves
     let mut reversed = sections();
     reversed.reverse();
-    let before = fitted(&PLAIN, &sections(), Method::BySize).unwrap();
-    let off = largest_difference(&before, &fitted(&PLAIN, &reversed, Method::BySize).unwrap());
-    assert!(off < 0.02, "{off} mm, more than a contour errs");
+    for method in [Method::BySize, Method::Iterative] {
+        let before = fitted(&PLAIN, &sections(), method).unwrap();
+        let off = largest_difference(&before, &fitted(&PLAIN, &reversed, method).unwrap());
+        assert!(off < 1e-8, "{method:?}: {off:e} mm");
+    }
 }
 
 #[test]
