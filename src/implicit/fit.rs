@@ -155,7 +155,7 @@ fn key(
     c: &Constraints,
     (scale, s, noise): (Scale, f64, &[f64]),
     (method, tolerance, draws): (Method, f64, usize),
-) -> [Vec<f64>; 9] {
+) -> [Vec<f64>; 10] {
     [
         [&scale.numbers()[..], &[s, c.wall as f64, f64::from(method as u8), tolerance, draws as f64]].concat(),
         c.points.iter().flat_map(|p| p.to_array()).collect(),
@@ -164,6 +164,7 @@ fn key(
         c.sigma_mm.clone(),
         c.level_mm.clone(),
         c.freedom.clone(),
+        c.correction_mm.clone(),
         c.curve.iter().map(|curve| curve.map_or(-1.0, |k| k as f64)).collect(),
         c.interior.iter().flat_map(|(wall, offset)| [*wall as f64, *offset]).collect(),
     ]

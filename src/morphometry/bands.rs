@@ -22,9 +22,15 @@ use space::{P3, V3};
 /// Standard deviations of a 95 % band of a normal error.
 const DEVIATIONS: f64 = 1.96;
 
-/// value +- 1.96 standard deviations of drawn values about it; `None` where a draw has no value.
-pub(crate) fn band95(value: f64, drawn: impl Iterator<Item = Option<f64>>) -> Option<[f64; 2]> {
-    let half = DEVIATIONS * deviation(value, drawn)?;
+/// Half of a 95 % band in standard deviations that `count` draws give: Student's quantile, expanded about the normal one
+/// (Abramowitz and Stegun 26.7.5), 2.06 at 24 draws.
+fn deviations(count: usize) -> f64 {
+    DEVIATIONS * (1.0 + (DEVIATIONS.powi(2) + 1.0) / (4.0 * count.max(1) as f64))
+}
+
+/// value +- a 95 % band from drawn values about it; `None` where a draw has no value.
+pub(crate) fn band95(value: f64, drawn: impl ExactSizeIterator<Item = Option<f64>>) -> Option<[f64; 2]> {
+    let half = deviations(drawn.len()) * deviation(value, drawn)?;
     Some([value - half, value + half])
 }
 
