@@ -1,7 +1,7 @@
 //! Reads of single rows that many callers want at the same time, as one statement.
 //!
-//! A read through sqlx costs two changes of thread on SQLite and four round trips under row level security on PostgreSQL,
-//! some 60 us of processor here, whatever it reads. So while as many batches as [`BATCHES`] are under way, further callers
+//! A read costs four round trips under row level security on PostgreSQL, some 60 us of processor here, whatever it reads
+//! (SQLite's cost less since docs/adr/0074). So while as many batches as [`BATCHES`] are under way, further callers
 //! wait together, and the first whose turn comes asks for all of them. A lonely caller waits for nobody. What a caller
 //! gets was read after it asked, so nobody sees anything older than without this.
 

@@ -1,8 +1,8 @@
 //! Values, rows and transactions that mean the same on both databases.
 
+use super::sqlite;
 use sqlx::postgres::{PgConnection, PgRow};
-use sqlx::sqlite::{SqliteConnection, SqliteRow};
-use sqlx::{AssertSqlSafe, ColumnIndex, Decode, Postgres, Row as _, Sqlite, Type};
+use sqlx::{Decode, Postgres, Row as _, Type};
 
 /// A bound value. Every integer is 64 bits wide, truth values are 0 and 1; a missing value keeps its type.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,7 +54,7 @@ pub(crate) use args;
 #[derive(Debug)]
 pub enum Row {
     /// Of SQLite.
-    Sqlite(SqliteRow),
+    Sqlite(sqlite::Cells),
     /// Of PostgreSQL.
     Postgres(PgRow),
 }
@@ -66,11 +66,10 @@ impl Row {
     /// No such column, or of another type.
     pub fn get<'r, T>(&'r self, column: &str) -> sqlx::Result<T>
     where
-        T: Decode<'r, Sqlite> + Type<Sqlite> + Decode<'r, Postgres> + Type<Postgres>,
-        for<'c> &'c str: ColumnIndex<SqliteRow> + ColumnIndex<PgRow>,
+        T: sqlite::FromCell<'r> + Decode<'r, Postgres> + Type<Postgres>,
     {
         match self {
-            Self::Sqlite(row) => row.try_get(column),
+            Self::Sqlite(row) => row.get(column),
             Self::Postgres(row) => row.try_get(column),
         }
     }
@@ -88,7 +87,7 @@ impl Row {
 #[derive(Debug)]
 pub enum Tx<'a> {
     /// Of SQLite.
-    Sqlite(&'a mut SqliteConnection),
+    Sqlite(&'a mut rusqlite::Connection),
     /// Of PostgreSQL.
     Postgres(&'a mut PgConnection),
 }
@@ -116,10 +115,7 @@ impl Tx<'_> {
     /// The database's.
     pub async fn rows(&mut self, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
         match self {
-            Self::Sqlite(connection) => {
-                let rows = bound!(AssertSqlSafe(super::sqlite::words(sql)), args).fetch_all(&mut **connection).await?;
-                Ok(rows.into_iter().map(Row::Sqlite).collect())
-            }
+            Self::Sqlite(connection) => sqlite::rows(connection, sql, &args),
             Self::Postgres(connection) => {
                 let rows = bound!(sql, args).fetch_all(&mut **connection).await?;
                 Ok(rows.into_iter().map(Row::Postgres).collect())
@@ -141,10 +137,7 @@ impl Tx<'_> {
     /// The database's.
     pub async fn run(&mut self, sql: &'static str, args: Vec<Value>) -> sqlx::Result<u64> {
         match self {
-            Self::Sqlite(connection) => {
-                let done = bound!(AssertSqlSafe(super::sqlite::words(sql)), args).execute(&mut **connection).await?;
-                Ok(done.rows_affected())
-            }
+            Self::Sqlite(connection) => sqlite::run(connection, sql, &args),
             Self::Postgres(connection) => Ok(bound!(sql, args).execute(&mut **connection).await?.rows_affected()),
         }
     }
