@@ -35,7 +35,9 @@ impl Scans {
     fn new() -> Self {
         let scans = Self(TempDir::new().unwrap());
         for seed in ["1", "2"] {
-            vasculum(&["phantom", "anastomosis", "--seed", seed, "--out", path(&scans.0.path().join(seed))]);
+            let small = ["--size", "160", "--pixel", "0.8", "--slices", "27", "--spacing", "2.5"];
+            let out = scans.0.path().join(seed);
+            vasculum(&[&["phantom", "anastomosis", "--seed", seed, "--out", path(&out)], &small[..]].concat());
         }
         scans
     }

@@ -19,7 +19,9 @@ fn scan() -> &'static Path {
     static SCAN: OnceLock<TempDir> = OnceLock::new();
     SCAN.get_or_init(|| {
         let dir = TempDir::new().unwrap();
-        let out = vasculum(&["phantom", "anastomosis", "--seed", "7", "--out", path(dir.path())]);
+        let small = ["--size", "160", "--pixel", "0.8", "--slices", "27", "--spacing", "2.5"];
+        let out =
+            vasculum(&[&["phantom", "anastomosis", "--seed", "7", "--out", path(dir.path())], &small[..]].concat());
         assert!(out.status.success(), "{}", text(&out.stderr));
         dir
     })

@@ -1,10 +1,12 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
 use crate::{drawn, shell, storm, surfaces, survey, tools};
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, bail};
+use std::collections::VecDeque;
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
+use std::sync::Mutex;
 
 /// Noise seeds of the demo scan that the test command reconstructs (the survey runs ten).
 const SEEDS: u64 = 3;
@@ -33,25 +35,42 @@ pub(crate) fn all() -> Result<()> {
     shell::run(test)?;
     tools::release(&["survey", "storm"])?;
     let judged = judged()?;
-    together(
-        || judges(&judged).and_then(|()| storm::short(&tools::built_example("storm")?)),
-        || {
-            portal(&judged)?;
-            survey::run(&judged.binary, 1, SEEDS)?;
-            drawn::run(&judged.binary, 1, DRAWN)
-        },
-    )?;
+    let mut checks: Vec<Check<'_>> = vec![
+        // the longest first
+        Box::new(|| drawn::run(&judged.binary, 1, DRAWN)),
+        Box::new(|| storm::short(&tools::built_example("storm")?)),
+        Box::new(|| survey::run(&judged.binary, 1, SEEDS)),
+    ];
+    checks.extend(browsers(&judged)?);
+    checks.extend(judges(&judged)?);
+    beside(checks)?;
     fs::remove_dir_all(&judged.work)?;
     eprintln!("xtask: all checks passed");
     Ok(())
 }
 
-/// Both at the same time: they start services and browsers, and wait for them more than they work.
-fn together(one: impl FnOnce() -> Result<()> + Send, other: impl FnOnce() -> Result<()> + Send) -> Result<()> {
+type Check<'a> = Box<dyn FnOnce() -> Result<()> + Send + 'a>;
+
+/// Checks at the same time: they start services and browsers and wait for them about as much as they work.
+const BESIDE: usize = 3;
+
+/// Run checks, some at a time; none is begun after one has failed.
+fn beside(checks: Vec<Check<'_>>) -> Result<()> {
+    let waiting = Mutex::new(VecDeque::from(checks));
+    let take = || waiting.lock().ok()?.pop_front();
+    let give_up = || waiting.lock().into_iter().for_each(|mut left| left.clear());
+    let work = || {
+        while let Some(check) = take() {
+            check().inspect_err(|error| {
+                eprintln!("xtask: {error:#}");
+                give_up();
+            })?;
+        }
+        Ok(())
+    };
     std::thread::scope(|scope| {
-        let one = scope.spawn(one);
-        let other = other().inspect_err(|e| eprintln!("xtask: {e:#}"));
-        one.join().unwrap_or_else(|_| Err(anyhow!("a check panicked"))).and(other)
+        let workers = [(); BESIDE].map(|()| scope.spawn(work));
+        workers.into_iter().try_for_each(|worker| worker.join().unwrap_or_else(|_| bail!("a check panicked")))
     })
 }
 
@@ -111,11 +130,12 @@ fn fresh_folder() -> Result<PathBuf> {
 }
 
 /// Programs that we did not write read what we write.
-fn judges(judged: &Judged) -> Result<()> {
+fn judges(judged: &Judged) -> Result<Vec<Check<'_>>> {
+    let mut checks: Vec<Check<'_>> = Vec::new();
     // The benches need programs of their own; here only that they can be read.
     let mut benches = shell::command(&judged.python);
     benches.args(["-m", "compileall", "-q", "tests/bench"]);
-    shell::run(benches)?;
+    checks.push(Box::new(|| shell::run_whole(benches)));
     for script in scripts("tests/python", "py")? {
         let mut judge = shell::command(&judged.python);
         judge
@@ -126,22 +146,23 @@ fn judges(judged: &Judged) -> Result<()> {
             .env("VASCULUM_JUDGED", tools::target()?.join("debug/examples/judged"))
             .env("VASCULUM_NODE", &judged.node)
             .env("VASCULUM_S3S", tools::s3()?);
-        judge_one(judge, judged)?;
+        checks.push(Box::new(|| judge_one(judge, judged)));
     }
-    Ok(())
+    Ok(checks)
 }
 
 /// The portal and the files for browsers, in a browser.
-fn portal(judged: &Judged) -> Result<()> {
+fn browsers(judged: &Judged) -> Result<Vec<Check<'_>>> {
+    let mut checks: Vec<Check<'_>> = Vec::new();
     for script in scripts("tests/js", "mjs")? {
         // modules resolve packages from their own folder: run a copy beside node_modules
         let copy = judged.node.join(script.file_name().unwrap_or_default());
         fs::copy(&script, &copy)?;
         let mut judge = shell::command("node");
         judge.arg(&copy).env("VASCULUM_WORK", &judged.work);
-        judge_one(judge, judged)?;
+        checks.push(Box::new(|| judge_one(judge, judged)));
     }
-    Ok(())
+    Ok(checks)
 }
 
 fn judge_one(mut judge: Command, judged: &Judged) -> Result<()> {
