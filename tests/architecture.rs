@@ -24,7 +24,8 @@ const ARROWS: &[(&str, &[&str])] = &[
 /// Crates that hold numbers only.
 const DOMAIN: &[&str] = &["space", "exec", "imaging", "implicit", "surface", "skeleton", "morphometry", "phantom"];
 /// What a domain crate never imports.
-const FOREIGN: &[&str] = &["tokio", "axum", "sqlx", "serde", "serde_json", "tracing", "image", "zip", "reqwest"];
+const FOREIGN: &[&str] =
+    &["tokio", "axum", "sqlx", "rusqlite", "serde", "serde_json", "tracing", "image", "zip", "reqwest"];
 
 fn packages() -> Vec<Value> {
     let out = Command::new(env!("CARGO"))

@@ -34,7 +34,8 @@ pub struct Constraints {
     /// For each wall constraint how far its contour was moved by the planar half-maximum correction, mm outward in the
     /// plane; `None` where no other correction may take its place (tips, end planes, no known blur).
     pub planar_shift: Vec<Option<V3>>,
-    /// For each wall constraint how far it lies from where its contour was drawn, mm: the half-maximum correction.
+    /// For each wall constraint how far it lies from where its contour was drawn, mm: the half-maximum correction. Empty in the
+    /// first pass, which draws nothing.
     pub correction_mm: Vec<f64>,
 }
 
@@ -75,7 +76,6 @@ pub(crate) fn planar(contours: &Contours, settings: &Settings) -> Constraints {
         c.freedom.push(w.freedom);
         c.curve.push(Some(w.curve));
         c.planar_shift.push(w.planar_shift);
-        c.correction_mm.push(w.planar_shift.map_or(0.0, V3::length));
     }
     push_tips(contours, &mut c);
     for (i, w) in wall.iter().enumerate() {
@@ -161,7 +161,8 @@ fn wall_points(contours: &Contours, settings: &Settings) -> Vec<WallPoint> {
     // what samples the constraints later on (roughness) goes by their order
     let mut kept: Vec<(usize, &Curve)> = counted.kept(contours, stride).collect();
     kept.sort_by_key(|(_, c)| at(c));
-    kept.into_iter().flat_map(|(i, c)| points_on(contours, (i, at(c)), c, step)).collect()
+    let phase = |c: &Curve| (GOLDEN * at(c) as f64).fract();
+    kept.into_iter().flat_map(|(i, c)| points_on(contours, i, c, step, phase(c))).collect()
 }
 
 /// Growth of the step between wall points of a contour before planes are left out.
@@ -205,8 +206,8 @@ fn count_on(curve: &Curve, step: f64) -> usize {
 /// Points of one curve, denser where it bends: density = (1 + |kappa| R) / 2 with R = length / 2 pi, so that a circle
 /// is sampled evenly.
 ///
-/// `number` is that of the curve and that of its plane as [`Counted`].
-fn points_on(contours: &Contours, number: (usize, usize), curve: &Curve, step: f64) -> Vec<WallPoint> {
+/// `phase` in [0, 1) places the first one.
+fn points_on(contours: &Contours, number: usize, curve: &Curve, step: f64, phase: f64) -> Vec<WallPoint> {
     let plane = &contours.planes[curve.plane];
     let length = curve.length_mm();
     let fine = 4 * count_on(curve, step).max(32);
@@ -219,7 +220,6 @@ fn points_on(contours: &Contours, number: (usize, usize), curve: &Curve, step: f
     }
     let total = cumulative[fine];
     let count = count_on(curve, step);
-    let phase = (GOLDEN * number.1 as f64).fract();
     let polygons = polygons(contours, curve.plane);
     // at the end planes the first function already closes: its bend along the vessel is not the wall's
     let at_end = contours.cuts.iter().any(|cut| {
@@ -244,7 +244,7 @@ fn points_on(contours: &Contours, number: (usize, usize), curve: &Curve, step: f
             sigma_mm: p.standard_error_mm.max(LEAST_SIGMA_PX * contours.pixel_mm),
             level_mm: curve.level_error_mm,
             freedom: curve.freedom,
-            curve: number.0,
+            curve: number,
             planar_shift: contours.blur.filter(|_| !at_end).map(|b| p.inward * -b.planar_shift_mm(plane, &p)),
         });
     }
@@ -306,7 +306,6 @@ fn push_tips(contours: &Contours, c: &mut Constraints) {
         c.freedom.push(0.0);
         c.curve.push(None);
         c.planar_shift.push(None);
-        c.correction_mm.push(0.0);
         c.wall += 1;
     }
 }

@@ -1,6 +1,6 @@
 //! The database: one small trait, [`Database`], and two of them behind it.
 //!
-//! SQL is written once, in PostgreSQL's words with `now_ms()` for the database's clock; [`sqlite`] rewrites the two
+//! SQL is written once, in PostgreSQL's words with `now_ms()` for the database's clock; [`statement`] rewrites the three
 //! phrases that SQLite does not have. Rejected: a table trait implemented twice (some 40 statements each to keep
 //! equal by hand) and sqlx's `Any` (no group commit, no LISTEN). A value is bound and read through [`Value`] and
 //! [`Row`], so no caller names a dialect.
@@ -10,6 +10,7 @@
 
 mod postgres;
 mod sqlite;
+mod statement;
 mod together;
 mod value;
 

@@ -10,14 +10,13 @@
 //! connection, and two changes of thread per statement cost an idle machine more than the statement. A read that goes on
 //! for more than [`QUICK`] steps is begun again where it may block. sqlx still applies the migrations.
 
+use super::statement::{fault, is_interruption, rows, run};
 use super::{Database, Output, Row, Scope, Tx, Value, Work, migration_fault};
 use anyhow::Context as _;
 use async_trait::async_trait;
-use rusqlite::types::{ToSqlOutput, ValueRef};
-use rusqlite::{Connection, OpenFlags, ToSql};
+use rusqlite::{Connection, OpenFlags};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions as _, Connection as _};
-use std::borrow::Cow;
 use std::ffi::c_int;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -40,13 +39,6 @@ const QUICK: c_int = 50_000;
 const PREPARED: usize = 128;
 
 static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations/sqlite");
-
-/// SQL of PostgreSQL in SQLite's words.
-pub(super) fn words(sql: &str) -> String {
-    sql.replace("now_ms()", "CAST(unixepoch('subsec') * 1000 AS INTEGER)")
-        .replace(" FOR UPDATE SKIP LOCKED", "")
-        .replace(" FOR UPDATE", "")
-}
 
 struct Unit {
     work: Work,
@@ -192,27 +184,27 @@ impl Readers {
     async fn rows(self: &Arc<Self>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
         let turn = tokio::time::timeout(BUSY, self.turns.acquire()).await;
         let _turn = turn.map_err(|_| sqlx::Error::PoolTimedOut)?.map_err(|_| sqlx::Error::PoolClosed)?;
-        if let Some(quick) = self.read(sql, &args, true)? {
+        if let Some(quick) = self.read(sql, &args, Some(QUICK))? {
             return Ok(quick);
         }
         let readers = Arc::clone(self);
-        let slow = tokio::task::spawn_blocking(move || readers.read(sql, &args, false)).await;
+        let slow = tokio::task::spawn_blocking(move || readers.read(sql, &args, None)).await;
         Ok(slow.map_err(|_| sqlx::Error::WorkerCrashed)??.unwrap_or_default())
     }
 
-    /// Rows, or `None` where they are no quick matter.
-    fn read(&self, sql: &str, args: &[Value], quick: bool) -> sqlx::Result<Option<Vec<Row>>> {
+    /// Rows, or `None` where they want more than so many steps.
+    fn read(&self, sql: &str, args: &[Value], steps: Option<c_int>) -> sqlx::Result<Option<Vec<Row>>> {
         let waiting = self.idle().pop();
         let connection = match waiting {
             Some(connection) => connection,
             None => opened(&self.file, OpenFlags::SQLITE_OPEN_READ_ONLY)?,
         };
-        if quick {
-            connection.progress_handler(QUICK, Some(|| true)).map_err(fault)?;
+        if let Some(steps) = steps {
+            connection.progress_handler(steps, Some(|| true)).map_err(fault)?;
         }
         let rows = rows(&connection, sql, args);
         connection.progress_handler(0, None::<fn() -> bool>).map_err(fault)?;
-        let interrupted = rows.as_ref().is_err_and(|error| quick && is_interruption(error));
+        let interrupted = rows.as_ref().is_err_and(|error| steps.is_some() && is_interruption(error));
         // One that met another fault is not used again.
         if rows.is_ok() || interrupted {
             self.idle().push(connection);
@@ -229,168 +221,6 @@ impl Readers {
         self.turns.close();
         self.idle().clear();
     }
-}
-
-/// Every row of a statement.
-pub(super) fn rows(connection: &Connection, sql: &str, args: &[Value]) -> sqlx::Result<Vec<Row>> {
-    let mut statement = prepared(connection, sql, args)?;
-    let names: Arc<[String]> = statement.column_names().into_iter().map(str::to_owned).collect();
-    let mut out = Vec::new();
-    let mut found = statement.raw_query();
-    while let Some(row) = found.next().map_err(fault)? {
-        let values = (0..names.len()).map(|i| row.get(i).map_err(fault)).collect::<sqlx::Result<_>>()?;
-        out.push(Row::Sqlite(Cells { names: Arc::clone(&names), values }));
-    }
-    Ok(out)
-}
-
-/// Runs a statement; the number of rows it touched.
-pub(super) fn run(connection: &Connection, sql: &str, args: &[Value]) -> sqlx::Result<u64> {
-    let mut statement = prepared(connection, sql, args)?;
-    let mut found = statement.raw_query();
-    while found.next().map_err(fault)?.is_some() {}
-    Ok(connection.changes())
-}
-
-/// A statement whose `$N` are bound to the N-th argument.
-fn prepared<'c>(connection: &'c Connection, sql: &str, args: &[Value]) -> sqlx::Result<rusqlite::CachedStatement<'c>> {
-    let mut statement = connection.prepare_cached(&words(sql)).map_err(fault)?;
-    for i in 1..=statement.parameter_count() {
-        let number = statement.parameter_name(i).and_then(|name| name.get(1..)?.parse::<usize>().ok()).unwrap_or(i);
-        let missing = || sqlx::Error::Protocol(format!("the statement has no argument {number}"));
-        let value = number.checked_sub(1).and_then(|k| args.get(k)).ok_or_else(missing)?;
-        statement.raw_bind_parameter(i, value).map_err(fault)?;
-    }
-    Ok(statement)
-}
-
-impl ToSql for Value {
-    fn to_sql(&self) -> rusqlite::Result<ToSqlOutput<'_>> {
-        let value = match self {
-            Self::Text(Some(text)) => ValueRef::Text(text.as_bytes()),
-            Self::Int(Some(number)) => ValueRef::Integer(*number),
-            Self::Real(Some(number)) => ValueRef::Real(*number),
-            Self::Bytes(Some(bytes)) => ValueRef::Blob(bytes),
-            Self::Text(None) | Self::Int(None) | Self::Real(None) | Self::Bytes(None) => ValueRef::Null,
-        };
-        Ok(ToSqlOutput::Borrowed(value))
-    }
-}
-
-/// A row of SQLite.
-#[derive(Debug)]
-pub struct Cells {
-    names: Arc<[String]>,
-    values: Vec<rusqlite::types::Value>,
-}
-
-impl Cells {
-    pub(super) fn get<'r, T: FromCell<'r>>(&'r self, column: &str) -> sqlx::Result<T> {
-        let at = self.names.iter().position(|name| name == column);
-        let value =
-            at.and_then(|i| self.values.get(i)).ok_or_else(|| sqlx::Error::ColumnNotFound(column.to_owned()))?;
-        T::from_cell(value).ok_or_else(|| sqlx::Error::ColumnDecode {
-            index: column.to_owned(),
-            source: format!("a value of type {}", value.data_type()).into(),
-        })
-    }
-}
-
-/// What a cell can be read as.
-pub trait FromCell<'r>: Sized {
-    /// `None` where the cell is of another type.
-    fn from_cell(cell: &'r rusqlite::types::Value) -> Option<Self>;
-}
-
-macro_rules! from_cell {
-    ($($to:ty: $($variant:ident $value:ident => $make:expr),+;)*) => {
-        $(impl<'r> FromCell<'r> for $to {
-            fn from_cell(cell: &'r rusqlite::types::Value) -> Option<Self> {
-                match cell {
-                    $(rusqlite::types::Value::$variant($value) => Some($make),)+
-                    _ => None,
-                }
-            }
-        })*
-    };
-}
-
-from_cell! {
-    &'r str: Text v => v.as_str();
-    String: Text v => v.clone();
-    i64: Integer v => *v;
-    f64: Real v => *v, Integer v => *v as f64;
-    Vec<u8>: Blob v => v.clone();
-}
-
-impl<'r, T: FromCell<'r>> FromCell<'r> for Option<T> {
-    fn from_cell(cell: &'r rusqlite::types::Value) -> Option<Self> {
-        match cell {
-            rusqlite::types::Value::Null => Some(None),
-            other => T::from_cell(other).map(Some),
-        }
-    }
-}
-
-/// A fault of SQLite as sqlx tells those of a database.
-#[derive(Debug)]
-struct Fault {
-    code: c_int,
-    message: String,
-}
-
-impl std::fmt::Display for Fault {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "(code: {}) {}", self.code, self.message)
-    }
-}
-
-impl std::error::Error for Fault {}
-
-impl sqlx::error::DatabaseError for Fault {
-    fn message(&self) -> &str {
-        &self.message
-    }
-
-    fn code(&self) -> Option<Cow<'_, str>> {
-        Some(self.code.to_string().into())
-    }
-
-    fn kind(&self) -> sqlx::error::ErrorKind {
-        match self.code {
-            rusqlite::ffi::SQLITE_CONSTRAINT_UNIQUE | rusqlite::ffi::SQLITE_CONSTRAINT_PRIMARYKEY => {
-                sqlx::error::ErrorKind::UniqueViolation
-            }
-            _ => sqlx::error::ErrorKind::Other,
-        }
-    }
-
-    fn as_error(&self) -> &(dyn std::error::Error + Send + Sync + 'static) {
-        self
-    }
-
-    fn as_error_mut(&mut self) -> &mut (dyn std::error::Error + Send + Sync + 'static) {
-        self
-    }
-
-    fn into_error(self: Box<Self>) -> Box<dyn std::error::Error + Send + Sync + 'static> {
-        self
-    }
-}
-
-fn fault(error: rusqlite::Error) -> sqlx::Error {
-    match error {
-        rusqlite::Error::SqliteFailure(failure, message) => {
-            let message = message.unwrap_or_else(|| failure.to_string());
-            sqlx::Error::Database(Box::new(Fault { code: failure.extended_code, message }))
-        }
-        other => sqlx::Error::Protocol(other.to_string()),
-    }
-}
-
-fn is_interruption(error: &sqlx::Error) -> bool {
-    let code = error.as_database_error().and_then(|fault| fault.code().map(Cow::into_owned));
-    code.is_some_and(|code| code == rusqlite::ffi::SQLITE_INTERRUPT.to_string())
 }
 
 fn refuse(units: impl Iterator<Item = Unit>, error: &sqlx::Error) {
@@ -460,6 +290,27 @@ impl Drop for Sqlite {
         let thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take();
         if let Some(thread) = thread {
             let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::db::args;
+
+    #[tokio::test]
+    async fn a_long_read_is_begun_again_where_it_may_block() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let db = Sqlite::open(&folder.path().join("queue.db")).await.unwrap();
+        let count =
+            "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < $1) SELECT COUNT(*) AS n FROM n";
+        for (most, quick) in [(10_i64, true), (300_000, false)] {
+            let at_once = db.readers.read(count, &args![most], Some(QUICK)).unwrap();
+            assert_eq!(at_once.is_some(), quick, "{most}");
+            let rows = db.read(Scope::System, count, args![most]).await.unwrap();
+            assert_eq!(rows.first().unwrap().get::<i64>("n").unwrap(), most);
         }
     }
 }

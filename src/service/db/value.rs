@@ -1,6 +1,6 @@
 //! Values, rows and transactions that mean the same on both databases.
 
-use super::sqlite;
+use super::statement;
 use sqlx::postgres::{PgConnection, PgRow};
 use sqlx::{Decode, Postgres, Row as _, Type};
 
@@ -54,7 +54,7 @@ pub(crate) use args;
 #[derive(Debug)]
 pub enum Row {
     /// Of SQLite.
-    Sqlite(sqlite::Cells),
+    Sqlite(statement::Cells),
     /// Of PostgreSQL.
     Postgres(PgRow),
 }
@@ -66,7 +66,7 @@ impl Row {
     /// No such column, or of another type.
     pub fn get<'r, T>(&'r self, column: &str) -> sqlx::Result<T>
     where
-        T: sqlite::FromCell<'r> + Decode<'r, Postgres> + Type<Postgres>,
+        T: statement::FromCell<'r> + Decode<'r, Postgres> + Type<Postgres>,
     {
         match self {
             Self::Sqlite(row) => row.get(column),
@@ -115,7 +115,7 @@ impl Tx<'_> {
     /// The database's.
     pub async fn rows(&mut self, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
         match self {
-            Self::Sqlite(connection) => sqlite::rows(connection, sql, &args),
+            Self::Sqlite(connection) => statement::rows(connection, sql, &args),
             Self::Postgres(connection) => {
                 let rows = bound!(sql, args).fetch_all(&mut **connection).await?;
                 Ok(rows.into_iter().map(Row::Postgres).collect())
@@ -137,7 +137,7 @@ impl Tx<'_> {
     /// The database's.
     pub async fn run(&mut self, sql: &'static str, args: Vec<Value>) -> sqlx::Result<u64> {
         match self {
-            Self::Sqlite(connection) => sqlite::run(connection, sql, &args),
+            Self::Sqlite(connection) => statement::run(connection, sql, &args),
             Self::Postgres(connection) => Ok(bound!(sql, args).execute(&mut **connection).await?.rows_affected()),
         }
     }
