@@ -1,10 +1,10 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
 use crate::{drawn, shell, storm, surfaces, survey, tools};
-use anyhow::{Result, bail};
+use anyhow::{Context as _, Result, bail};
 use std::collections::VecDeque;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Mutex;
 
@@ -25,14 +25,9 @@ pub(crate) fn all() -> Result<()> {
     tools::compiler()?;
     tools::node()?;
     lint()?;
-    let mut test = shell::command("cargo");
     tools::postgres()?;
     tools::openssl()?;
-    // Its lack is then a failure of the queue's tests, not a reason to skip them.
-    test.args(["test", "--workspace", "--quiet"])
-        .env("VASCULUM_POSTGRES", "required")
-        .env("VASCULUM_S3S", tools::s3()?);
-    shell::run(test)?;
+    let tests = tests()?;
     tools::release(&["survey", "storm"])?;
     let judged = judged()?;
     let mut checks: Vec<Check<'_>> = vec![
@@ -42,6 +37,7 @@ pub(crate) fn all() -> Result<()> {
         Box::new(|| survey::run(&judged.binary, 1, SEEDS)),
     ];
     checks.extend(browsers(&judged)?);
+    checks.extend(tests);
     checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2)));
     checks.extend(judges(&judged)?);
     beside(checks)?;
@@ -82,6 +78,37 @@ fn lint() -> Result<()> {
     let mut clippy = shell::command("cargo");
     clippy.args(["clippy", "--workspace", "--all-targets", "--quiet", "--", "-D", "warnings"]);
     shell::run(clippy)
+}
+
+/// Every test of the workspace, built; each program of them is a check of its own, so that one that waits keeps none waiting.
+fn tests() -> Result<Vec<Check<'static>>> {
+    let mut build = shell::command("cargo");
+    build.args(["test", "--workspace", "--no-run", "--quiet", "--message-format", "json-render-diagnostics"]);
+    let mut checks: Vec<Check<'static>> = Vec::new();
+    for line in shell::output(build)?.lines() {
+        let Some((program, folder)) = test_program(line)? else { continue };
+        let mut test = Command::new(program);
+        // Its lack is then a failure of the queue's tests, not a reason to skip them.
+        test.arg("--quiet").current_dir(folder).env("VASCULUM_POSTGRES", "required").env("VASCULUM_S3S", tools::s3()?);
+        checks.push(Box::new(|| shell::run_whole(test)));
+    }
+    if checks.is_empty() {
+        bail!("cargo names no tests");
+    }
+    let mut documented = shell::command("cargo");
+    documented.args(["test", "--workspace", "--doc", "--quiet"]);
+    checks.push(Box::new(|| shell::run_whole(documented)));
+    Ok(checks)
+}
+
+/// A program of tests and the folder that it wants to run in, where cargo's line tells of one.
+fn test_program(line: &str) -> Result<Option<(PathBuf, PathBuf)>> {
+    let told: serde_json::Value = serde_json::from_str(line)?;
+    let (Some(program), Some(manifest)) = (told["executable"].as_str(), told["manifest_path"].as_str()) else {
+        return Ok(None);
+    };
+    let folder = Path::new(manifest).parent().context("a manifest lies in a folder")?;
+    Ok((told["profile"]["test"] == true).then(|| (program.into(), folder.into())))
 }
 
 /// What the judges get: the program, and one scan with its result.

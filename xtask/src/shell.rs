@@ -41,6 +41,18 @@ pub(crate) fn run_whole(mut command: Command) -> Result<()> {
     })
 }
 
+/// Show and run; what it wrote for programs to read. What it has for people it shows.
+pub(crate) fn output(mut command: Command) -> Result<String> {
+    eprintln!("+ {}", words(&command));
+    let mut written = Vec::new();
+    timed(&mut command, |command| {
+        let output = command.stderr(Stdio::inherit()).output()?;
+        written = output.stdout;
+        Ok(output.status)
+    })?;
+    Ok(String::from_utf8(written)?)
+}
+
 fn timed(command: &mut Command, run: impl FnOnce(&mut Command) -> io::Result<ExitStatus>) -> Result<()> {
     let started = std::time::Instant::now();
     let status = run(command).with_context(|| format!("cannot run {}", words(command)))?;

@@ -44,12 +44,8 @@ impl Camera {
         let back = towards_viewer.normalised().unwrap_or(-V3::Y);
         let up = (up - back * up.dot(back)).normalised().unwrap_or(back.any_orthonormal());
         let right = up.cross(back);
-        let extent = |d: V3| {
-            let along = mesh.vertices.iter().map(|&p| (p - P3::ORIGIN).dot(d));
-            along.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)))
-        };
         let middle = |(a, b): (f64, f64)| if a <= b { 0.5 * (a + b) } else { 0.0 };
-        let (x, y, z) = (extent(right), extent(up), extent(back));
+        let [x, y, z] = [right, up, back].map(|d| extent(mesh, d));
         let centre = P3::ORIGIN + right * middle(x) + up * middle(y) + back * middle(z);
         let needed = ((x.1 - x.0) / size[0] as f64).max((y.1 - y.0) / size[1] as f64) / FILL;
         let mm_per_px = if needed.is_finite() && needed > 0.0 { needed } else { 1.0 };
@@ -73,16 +69,31 @@ impl Camera {
     }
 }
 
-/// The two directions of the report: onto the plane of the main junction (from the side nearer to anterior)
-/// and along it; from anterior and from the left where there is no plane. The head is up unless one looks along it.
+/// The interval that a mesh covers along a direction.
+fn extent(mesh: &TriMesh, d: V3) -> (f64, f64) {
+    let along = mesh.vertices.iter().map(|&p| (p - P3::ORIGIN).dot(d));
+    along.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)))
+}
+
+/// The two directions of the report: onto the plane of the junction (from the side nearer to anterior) and along it; from
+/// anterior and from the left where there is none. Of several planes, and the coronal one, that is taken along whose normal
+/// the vessels are least deep: the main junction's own may look down the trunk of a tree. The head is up unless one looks
+/// along it.
 pub fn cameras(r: &Reconstruction<'_>, size: [usize; 2]) -> [Camera; 2] {
     let anterior = -V3::Y;
-    let normal = r.main_junction().and_then(|j| j.plane_normal);
-    let front = match normal {
-        Some(n) if n.dot(anterior) < -1e-9 => -n,
-        Some(n) => n,
-        None => anterior,
+    let planes: Vec<V3> = r.morphometry.junctions.iter().filter_map(|j| j.plane_normal).collect();
+    let front = match planes.as_slice() {
+        [] => anterior,
+        [one] => *one,
+        several => {
+            let depth = |n: &V3| {
+                let (near, far) = extent(r.surface.mesh, *n);
+                far - near
+            };
+            several.iter().copied().chain([anterior]).min_by(|a, b| depth(a).total_cmp(&depth(b))).unwrap_or(anterior)
+        }
     };
+    let front = if front.dot(anterior) < -1e-9 { -front } else { front };
     let up = if front.dot(V3::Z).abs() < 0.9 { V3::Z } else { anterior };
     let upright = (up - front * up.dot(front)).normalised().unwrap_or(front.any_orthonormal());
     let side = upright.cross(front);

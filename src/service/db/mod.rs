@@ -49,6 +49,9 @@ pub trait Database: Send + Sync + std::fmt::Debug {
     /// Runs `work` in a transaction and returns after its commit is durable.
     async fn write(&self, scope: Scope<'_>, work: Work) -> sqlx::Result<Output>;
 
+    /// Rows of one statement that writes, in a transaction of its own; returns after the commit is durable.
+    async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>>;
+
     /// The same database for a thread with a runtime of its own.
     async fn for_thread(&self) -> sqlx::Result<Arc<dyn Database>>;
 
@@ -112,11 +115,15 @@ impl Db {
             let work = work(tx);
             Box::pin(async move { work.await.map(|value| Box::new(value) as Output) })
         });
-        let output = self.0.write(scope, boxed).await?;
-        output
-            .downcast::<T>()
-            .map(|value| *value)
-            .map_err(|_| sqlx::Error::Protocol("a write's output was lost".into()))
+        unboxed(self.0.write(scope, boxed).await?)
+    }
+
+    /// The first row of one statement that writes, in a transaction of its own.
+    ///
+    /// # Errors
+    /// The database's; nothing was written.
+    pub async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Option<Row>> {
+        Ok(self.0.change(scope, sql, args).await?.into_iter().next())
     }
 
     /// One statement in a transaction of its own; the number of rows it touched.
@@ -163,6 +170,11 @@ impl Db {
     pub async fn close(&self) {
         self.0.close().await;
     }
+}
+
+/// What a unit of writing gave back.
+fn unboxed<T: 'static>(output: Output) -> sqlx::Result<T> {
+    output.downcast::<T>().map(|value| *value).map_err(|_| sqlx::Error::Protocol("a write's output was lost".into()))
 }
 
 /// The words for a migration that failed.

@@ -11,7 +11,7 @@
 //! for more than [`QUICK`] steps is begun again where it may block. sqlx still applies the migrations.
 
 use super::statement::{fault, is_interruption, rows, run};
-use super::{Database, Output, Row, Scope, Tx, Value, Work, migration_fault};
+use super::{Database, Output, Row, Scope, Tx, Value, Work, migration_fault, unboxed};
 use anyhow::Context as _;
 use async_trait::async_trait;
 use rusqlite::{Connection, OpenFlags};
@@ -247,6 +247,11 @@ impl Database for Sqlite {
         answer.await.map_err(|_| sqlx::Error::WorkerCrashed)?
     }
 
+    async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
+        let work: Work = Box::new(move |tx| Box::pin(async move { Ok(Box::new(tx.rows(sql, args).await?) as Output) }));
+        unboxed(self.write(scope, work).await?)
+    }
+
     async fn for_thread(&self) -> sqlx::Result<Arc<dyn Database>> {
         let readers = Arc::new(Readers::new(&self.file, 1));
         let thread = Arc::clone(&self.thread);
@@ -307,7 +312,7 @@ mod tests {
         let count =
             "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < $1) SELECT COUNT(*) AS n FROM n";
         for (most, quick) in [(10_i64, true), (300_000, false)] {
-            let at_once = db.readers.read(count, &args![most], Some(QUICK)).unwrap();
+            let at_once = db.readers.read(count, &[Value::from(most)], Some(QUICK)).unwrap();
             assert_eq!(at_once.is_some(), quick, "{most}");
             let rows = db.read(Scope::System, count, args![most]).await.unwrap();
             assert_eq!(rows.first().unwrap().get::<i64>("n").unwrap(), most);

@@ -4,8 +4,7 @@
 //! priority are on one scale, the order of two queued jobs never changes and an index holds it: a drain costs the same
 //! with 10^3 and 10^6 jobs queued. A tenant at its cap of running jobs is passed over whole, never scanned.
 
-use super::submit::record;
-use super::{JobState, LEASE_MS, Queue};
+use super::{LEASE_MS, Queue};
 use crate::db::{Row, Scope, Tx, args};
 use uuid::Uuid;
 
@@ -115,12 +114,15 @@ impl Queue {
             Room::Memory(mb) => mb,
         };
         // An idle worker only reads: it takes no write lock and costs no commit.
-        if self.db().row(Scope::System, NEXT_TENANT, args![memory]).await?.is_none() {
-            return Ok(None);
-        }
-        let owner = owner.to_owned();
-        let claim =
-            self.db().write(Scope::System, move |tx| Box::pin(async move { take(tx, &owner, memory).await })).await?;
+        let Some(next) = self.db().row(Scope::System, NEXT_TENANT, args![memory]).await? else { return Ok(None) };
+        let row = if next.get::<Option<i64>>("max_running")?.is_none() {
+            let tenant: String = next.get("tenant")?;
+            self.db().change(Scope::System, TAKE, args![owner, LEASE_MS, tenant, memory]).await?
+        } else {
+            let owner = owner.to_owned();
+            self.db().write(Scope::System, move |tx| Box::pin(async move { take(tx, &owner, memory).await })).await?
+        };
+        let claim = row.as_ref().map(Claim::of).transpose()?;
         if let Some(claim) = &claim {
             self.hint(claim.uuid());
         }
@@ -169,7 +171,8 @@ impl Queue {
     }
 }
 
-async fn take(tx: &mut Tx<'_>, owner: &str, memory: i64) -> sqlx::Result<Option<Claim>> {
+/// The next job, of whatever tenant it is now; a tenant's cap is kept.
+async fn take(tx: &mut Tx<'_>, owner: &str, memory: i64) -> sqlx::Result<Option<Row>> {
     let Some(next) = tx.row(NEXT_TENANT, args![memory]).await? else { return Ok(None) };
     let tenant: String = next.get("tenant")?;
     if let Some(most) = next.get::<Option<i64>>("max_running")? {
@@ -181,10 +184,7 @@ async fn take(tx: &mut Tx<'_>, owner: &str, memory: i64) -> sqlx::Result<Option<
             return Ok(None);
         }
     }
-    let Some(row) = tx.row(TAKE, args![owner, LEASE_MS, &tenant, memory]).await? else { return Ok(None) };
-    let claim = Claim::of(&row)?;
-    record(tx, &claim.id, "state").await?;
-    Ok(Some(claim))
+    tx.row(TAKE, args![owner, LEASE_MS, &tenant, memory]).await
 }
 
 async fn beaten(tx: &mut Tx<'_>, id: Uuid, fence: i64, beat: &Beat) -> sqlx::Result<Verdict> {
@@ -199,7 +199,9 @@ async fn beaten(tx: &mut Tx<'_>, id: Uuid, fence: i64, beat: &Beat) -> sqlx::Res
         tx.run(told, args![id, stage, beat.progress, beat.eta_s]).await?;
     }
     if beat.moved && beat.stages.is_empty() {
-        record(tx, &id.to_string(), "progress").await?;
+        let told = "INSERT INTO event (job, kind, state, stage, progress, eta_s, at) \
+                    VALUES ($1, 'progress', 'running', $2, $3, $4, now_ms())";
+        tx.run(told, args![id, &beat.stage, beat.progress, beat.eta_s]).await?;
     }
     Ok(if row.flag("cancel_requested")? { Verdict::Cancel } else { Verdict::Run })
 }
@@ -216,17 +218,14 @@ async fn rescued(tx: &mut Tx<'_>, dead: &[String]) -> sqlx::Result<Vec<Uuid>> {
         error = CASE WHEN cancel_requested = 0 AND attempt >= max_attempts THEN $2 END, \
         finished_at = CASE WHEN cancel_requested = 1 OR attempt >= max_attempts THEN now_ms() END, \
         fence = fence + 1, lease_owner = NULL, lease_until = NULL, revision = revision + 1 \
-        WHERE id = $1 AND state = 'running' RETURNING state";
+        WHERE id = $1 AND state = 'running'";
     let problem = super::finish::crashed("its worker ended or lost its lease").body();
     let mut ids = Vec::new();
     for row in &lost {
         let id: String = row.get("id")?;
-        let Some(after) = tx.row(back, args![&id, &problem]).await? else { continue };
-        record(tx, &id, "state").await?;
-        if JobState::of(after.get("state")?)?.is_final() {
-            super::finish::settle(tx, &id).await?;
+        if tx.run(back, args![&id, &problem]).await? > 0 {
+            ids.extend(Uuid::parse_str(&id).ok());
         }
-        ids.extend(Uuid::parse_str(&id).ok());
     }
     Ok(ids)
 }

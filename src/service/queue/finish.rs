@@ -1,6 +1,5 @@
 //! Ending a job: one transaction each, guarded by id, fence and `state = 'running'`.
 
-use super::submit::record;
 use super::{ArtefactRow, Claim, JobState, Queue};
 use crate::db::{Scope, Tx, args};
 use crate::error::Problem;
@@ -73,15 +72,18 @@ impl Queue {
     }
 }
 
+/// A cancel that comes in between wins, so the statement itself looks whether there is one.
+const END: &str = "UPDATE job SET state = CASE WHEN cancel_requested = 1 THEN 'cancelled' ELSE $3 END, \
+    error = CASE WHEN cancel_requested = 0 THEN $4 END, result = CASE WHEN cancel_requested = 0 THEN $5 END, \
+    stage = CASE WHEN cancel_requested = 0 AND $3 = 'failed' THEN stage END, \
+    progress = CASE WHEN cancel_requested = 1 THEN progress WHEN $3 = 'succeeded' THEN 1 WHEN $3 = 'queued' THEN 0 \
+        ELSE progress END, \
+    finished_at = CASE WHEN cancel_requested = 1 OR $3 <> 'queued' THEN now_ms() END, \
+    lease_owner = NULL, lease_until = NULL, eta_s = NULL, attempt = attempt - $6, run_at = now_ms() + $7, \
+    revision = revision + 1 WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING state";
+
 async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Result<Option<JobState>> {
-    let held = "SELECT cancel_requested FROM job WHERE id = $1 AND fence = $2 AND state = 'running' FOR UPDATE";
-    let Some(row) = tx.row(held, args![&claim.id, claim.fence]).await? else { return already(tx, claim).await };
-    let (state, error) = outcome(claim, closing, row.flag("cancel_requested")?);
-    let end = "UPDATE job SET state = $3, error = $4, lease_owner = NULL, lease_until = NULL, eta_s = NULL, \
-        progress = CASE WHEN $3 = 'succeeded' THEN 1 WHEN $3 = 'queued' THEN 0 ELSE progress END, \
-        stage = CASE WHEN $3 = 'failed' THEN stage END, result = $5, attempt = attempt - $6, run_at = now_ms() + $7, \
-        finished_at = CASE WHEN $3 = 'queued' THEN NULL ELSE now_ms() END, revision = revision + 1 \
-        WHERE id = $1 AND fence = $2 AND state = 'running'";
+    let (state, error) = outcome(claim, closing);
     let pause = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) {
         BACKOFF_MS * claim.attempt * claim.attempt
     } else {
@@ -96,15 +98,12 @@ async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Resu
         matches!(closing, Closing::HandedBack),
         pause,
     ];
-    tx.run(end, values).await?;
+    let Some(row) = tx.row(END, values).await? else { return already(tx, claim).await };
+    let state = JobState::of(row.get("state")?)?;
     if let (JobState::Succeeded, Closing::Succeeded(published)) = (state, closing) {
         for artefact in &published.artefacts {
             name_artefact(tx, &claim.id, artefact).await?;
         }
-    }
-    record(tx, &claim.id, "state").await?;
-    if state.is_final() {
-        settle(tx, &claim.id).await?;
     }
     Ok(Some(state))
 }
@@ -118,24 +117,8 @@ async fn already(tx: &mut Tx<'_>, claim: &Claim) -> sqlx::Result<Option<JobState
     row.map(|row| JobState::of(row.get("state")?)).transpose()
 }
 
-/// What follows a final state, in its transaction: the end of the tenant's retention, and a message for each webhook.
-pub(super) async fn settle(tx: &mut Tx<'_>, id: &str) -> sqlx::Result<()> {
-    let keep = "UPDATE job SET expires_at = finished_at + \
-                (SELECT retention_ms FROM tenant WHERE tenant.id = job.tenant) WHERE id = $1 \
-                AND EXISTS (SELECT 1 FROM tenant WHERE tenant.id = job.tenant AND retention_ms IS NOT NULL)";
-    tx.run(keep, args![id]).await?;
-    let tell = "INSERT INTO outbox (id, webhook, body, run_at) \
-        SELECT webhook.id || '.' || job.id || '.' || CAST(job.revision AS TEXT), webhook.id, \
-        '{\"id\":\"' || job.id || '\",\"state\":\"' || job.state || '\",\"at\":' || CAST(job.finished_at AS TEXT) || '}', \
-        now_ms() FROM job JOIN webhook ON webhook.tenant = job.tenant WHERE job.id = $1";
-    tx.run(tell, args![id]).await?;
-    Ok(())
-}
-
-fn outcome(claim: &Claim, closing: &Closing, cancel: bool) -> (JobState, Option<Problem>) {
-    if cancel {
-        return (JobState::Cancelled, None);
-    }
+/// What a hold's end makes of a job that nobody cancels.
+fn outcome(claim: &Claim, closing: &Closing) -> (JobState, Option<Problem>) {
     match closing {
         Closing::Succeeded(_) => (JobState::Succeeded, None),
         Closing::Failed(problem) => (JobState::Failed, Some(problem.clone())),

@@ -1,6 +1,5 @@
 //! Accepting, cancelling, retrying and erasing: the writes of the API.
 
-use super::finish::settle;
 use super::{AGEING_MS, JobRow, JobState, Queue};
 use crate::db::{Scope, Tx, args};
 use uuid::Uuid;
@@ -53,14 +52,6 @@ pub enum Submitted {
     Replayed(Box<JobRow>),
     /// The key was used before with another input or plan.
     Mismatch(Box<JobRow>),
-}
-
-/// Appends the event that tells a job's present row.
-pub(super) async fn record(tx: &mut Tx<'_>, id: &str, kind: &str) -> sqlx::Result<()> {
-    let told = "INSERT INTO event (job, kind, state, stage, progress, eta_s, at) \
-                SELECT id, $2, state, stage, progress, eta_s, now_ms() FROM job WHERE id = $1";
-    tx.run(told, args![id, kind]).await?;
-    Ok(())
 }
 
 impl Queue {
@@ -167,7 +158,6 @@ impl Queue {
                     if tx.run(back, args![id, &owner]).await? == 0 {
                         return Ok(None);
                     }
-                    record(tx, &id.to_string(), "state").await?;
                     one(tx, &owner, id).await
                 })
             })
@@ -183,18 +173,9 @@ impl Queue {
     pub async fn prioritise(&self, tenant: &str, id: Uuid, priority: i64) -> sqlx::Result<Option<JobRow>> {
         let sql = "UPDATE job SET rank = rank - ($3 - priority) * $4, priority = $3, revision = revision + 1 \
                    WHERE id = $1 AND tenant = $2 AND state = 'queued' RETURNING *";
-        let owner = tenant.to_owned();
-        let row = self
-            .db()
-            .write(Scope::Tenant(tenant), move |tx| {
-                Box::pin(async move {
-                    let row = tx.row(sql, args![id, &owner, priority, AGEING_MS]).await?;
-                    row.as_ref().map(JobRow::of).transpose()
-                })
-            })
-            .await?;
+        let row = self.db().change(Scope::Tenant(tenant), sql, args![id, tenant, priority, AGEING_MS]).await?;
         self.hint(id);
-        Ok(row)
+        row.as_ref().map(JobRow::of).transpose()
     }
 
     /// Erases a job with its events and artefact rows. A worker that still runs it loses its lease at the next beat.
@@ -243,7 +224,6 @@ pub(super) async fn inserted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<JobR
         job.parent.map(|id| id.to_string()),
     ];
     let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
-    record(tx, &job.id.to_string(), "state").await?;
     JobRow::of(&row)
 }
 
@@ -257,8 +237,7 @@ async fn cancelled(tx: &mut Tx<'_>, tenant: &str, id: &str) -> sqlx::Result<()> 
     let at_once = "UPDATE job SET state = 'cancelled', cancel_requested = 1, revision = revision + 1, \
                    finished_at = now_ms() WHERE id = $1 AND tenant = $2 AND state = 'queued'";
     if tx.run(at_once, args![id, tenant]).await? > 0 {
-        record(tx, id, "state").await?;
-        return settle(tx, id).await;
+        return Ok(());
     }
     let ask = "UPDATE job SET cancel_requested = 1, revision = revision + 1 \
                WHERE id = $1 AND tenant = $2 AND state = 'running' AND cancel_requested = 0";

@@ -73,6 +73,7 @@ on_both! {
     retention_ends
     webhooks_get_a_message_in_the_same_commit
     a_tenant_sees_its_own_only
+    a_tenant_s_name_is_no_statement
     pages_follow_the_key
     workers_are_on_the_roll
     a_newer_schema_is_refused
@@ -474,6 +475,21 @@ async fn a_tenant_sees_its_own_only(b: Bench) {
         assert_eq!(q.db().rows(Scope::Tenant("default"), all, Vec::new()).await.unwrap().len(), 1);
         assert_eq!(q.db().rows(Scope::Tenant("ward"), "SELECT id FROM event", Vec::new()).await.unwrap().len(), 0);
         assert_eq!(q.db().run(Scope::Tenant("ward"), "DELETE FROM job", Vec::new()).await.unwrap(), 0);
+    }
+}
+
+async fn a_tenant_s_name_is_no_statement(b: Bench) {
+    let q = &b.queue;
+    add(q, |_| {}).await;
+    for name in ["'; SET vasculum.tenant = '*", "\\'; SET vasculum.tenant = '*'; --", "Saint John's", "$1 \\ {}"] {
+        tenants::set(q.db(), name, None, None).await.unwrap();
+        let id = add(q, |j| j.tenant = name.into()).await;
+        assert_eq!(q.job(name, id).await.unwrap().unwrap().tenant, name);
+        assert_eq!(q.counts(Some(name)).await.unwrap().queued, 1);
+        if b.config.database_url.is_some() {
+            let all = q.db().rows(Scope::Tenant(name), "SELECT id FROM job", Vec::new()).await.unwrap();
+            assert_eq!(all.len(), 1, "{name}");
+        }
     }
 }
 
