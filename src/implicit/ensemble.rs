@@ -20,6 +20,7 @@ use crate::constraints::Constraints;
 use crate::interpolate::Solver;
 use crate::kernel::Centres;
 use crate::system::Scale;
+use crate::waves::{Wave, Waves};
 use exec::Ctx;
 use imaging::Contours;
 use space::P3;
@@ -62,17 +63,9 @@ pub struct Ensemble {
 
 #[derive(Clone, Debug)]
 struct Draw {
-    waves: Vec<Wave>,
+    waves: Waves,
     centres: Centres,
     polynomial: [f64; 4],
-}
-
-/// amplitude cos(k . t + phase), t scaled.
-#[derive(Clone, Copy, Debug)]
-struct Wave {
-    k: [f64; 3],
-    phase: f64,
-    amplitude: f64,
 }
 
 /// Coefficients and polynomials of `count` draws for a solved fit with scale `s` of the field. The same for any number of
@@ -92,7 +85,7 @@ pub(crate) fn solved(
         let mut values = errors(c, &mut normal);
         let level = level_waves(&scale, &mut normal);
         for (v, (level_mm, p)) in values.iter_mut().zip(c.level_mm.iter().zip(&points)) {
-            *v += level_mm * sum(&level, *p);
+            *v += level_mm * level.at(*p);
         }
         let share = CORRECTION_ERROR * normal.next();
         values.iter_mut().zip(&c.correction_mm).for_each(|(v, mm)| *v += mm * share);
@@ -101,7 +94,7 @@ pub(crate) fn solved(
             values[c.wall + k] += values[*wall];
         }
         for (v, p) in values.iter_mut().zip(&points) {
-            *v += sum(&waves, *p);
+            *v += waves.at(*p);
         }
         values
     })?;
@@ -141,13 +134,9 @@ impl Draws for Ensemble {
         draw.centres.values(&targets, out);
         let b = &draw.polynomial;
         for (o, t) in out.iter_mut().zip(&targets) {
-            *o = sum(&draw.waves, *t) - *o - b[0] - b[1] * t[0] - b[2] * t[1] - b[3] * t[2];
+            *o = draw.waves.at(*t) - *o - b[0] - b[1] * t[0] - b[2] * t[1] - b[3] * t[2];
         }
     }
-}
-
-fn sum(waves: &[Wave], t: [f64; 3]) -> f64 {
-    waves.iter().fold(0.0, |s, w| s + w.amplitude * (w.k[0] * t[0] + w.k[1] * t[1] + w.k[2] * t[2] + w.phase).cos())
 }
 
 /// Median distance of a wall point to the next, scaled.
@@ -162,7 +151,7 @@ fn spacing(wall: &[[f64; 3]]) -> f64 {
 
 /// Waves of a field with covariance s |h|^3. With k drawn log-uniformly over a range of ln ratio L and directions evenly, the
 /// density s 96 pi / k^6 per d^3k / (2 pi)^3 gives each of M waves the variance 48 s L / (pi M k^3).
-fn waves(s: f64, longest: f64, normal: &mut Normal) -> Vec<Wave> {
+fn waves(s: f64, longest: f64, normal: &mut Normal) -> Waves {
     let range = (longest / WAVE_NUMBER_MIN).ln();
     (0..WAVES)
         .map(|i| {
@@ -180,7 +169,7 @@ fn waves(s: f64, longest: f64, normal: &mut Normal) -> Vec<Wave> {
 
 /// Waves of a field of variance 1 and covariance exp(-h^2 / (2 l^2)), l the distance over which levels err together: wave
 /// vectors are normal with deviation 1 / l.
-fn level_waves(scale: &Scale, normal: &mut Normal) -> Vec<Wave> {
+fn level_waves(scale: &Scale, normal: &mut Normal) -> Waves {
     let per_scaled = scale.length / Contours::LEVEL_MM;
     let amplitude = (2.0 / LEVEL_WAVES as f64).sqrt();
     (0..LEVEL_WAVES)
@@ -293,7 +282,7 @@ mod tests {
         let mut sum_of_squares = 0.0;
         for _ in 0..draws {
             let waves = waves(2.0, 2000.0, &mut normal);
-            let x: f64 = (0..4).map(|i| weights[i] * sum(&waves, [points[i], 0.3, -0.2])).sum();
+            let x: f64 = (0..4).map(|i| weights[i] * waves.at([points[i], 0.3, -0.2])).sum();
             sum_of_squares += x * x;
         }
         let ratio = sum_of_squares / f64::from(draws) / (2.0 * expected);

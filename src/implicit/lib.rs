@@ -25,6 +25,7 @@ mod system;
 #[cfg(test)]
 mod test_fields;
 mod variational;
+mod waves;
 mod wide;
 
 pub use constraints::Constraints;

@@ -84,12 +84,13 @@ fn lint() -> Result<()> {
 fn tests() -> Result<Vec<Check<'static>>> {
     let mut build = shell::command("cargo");
     build.args(["test", "--workspace", "--no-run", "--quiet", "--message-format", "json-render-diagnostics"]);
+    let (built, s3) = (shell::output(build)?, tools::s3()?);
     let mut checks: Vec<Check<'static>> = Vec::new();
-    for line in shell::output(build)?.lines() {
+    for line in built.lines() {
         let Some((program, folder)) = test_program(line)? else { continue };
         let mut test = Command::new(program);
         // Its lack is then a failure of the queue's tests, not a reason to skip them.
-        test.arg("--quiet").current_dir(folder).env("VASCULUM_POSTGRES", "required").env("VASCULUM_S3S", tools::s3()?);
+        test.arg("--quiet").current_dir(folder).env("VASCULUM_POSTGRES", "required").env("VASCULUM_S3S", &s3);
         checks.push(Box::new(|| shell::run_whole(test)));
     }
     if checks.is_empty() {
