@@ -196,7 +196,7 @@ fn position(v: &Volume, voxels: &[u32]) -> f64 {
 /// Tree length in mm and number of ends besides the root: maxima of the geodesic distance from one extremity whose
 /// persistence passes `least`.
 fn tree(v: &Volume, voxels: &[u32], slots: &[u32], least: f64) -> (f64, usize) {
-    let links = links(v, voxels, slots);
+    let links = Links::new(v, voxels, slots);
     let far = |d: &[u32]| (0..d.len()).max_by_key(|&i| (d[i], std::cmp::Reverse(i))).unwrap_or(0);
     let root = far(&geodesic(&links, 0));
     let d = geodesic(&links, root);
@@ -208,41 +208,69 @@ fn tree(v: &Volume, voxels: &[u32], slots: &[u32], least: f64) -> (f64, usize) {
 /// Geodesic distances are integers of this many mm, which keeps them exact and their order fixed.
 const UNIT_MM: f64 = 0.05;
 
-type Links = Vec<Vec<(u32, u32)>>;
-
-/// 26-neighbours of each voxel within the component, with step lengths in [`UNIT_MM`].
-fn links(v: &Volume, voxels: &[u32], slots: &[u32]) -> Links {
-    let weight = NEIGHBOURS.map(|d| {
-        let l = (0..3).map(|a| (f64::from(d[a]) * v.step[a]).powi(2)).sum::<f64>().sqrt();
-        (l / UNIT_MM).round().max(1.0) as u32
-    });
-    let around = Around::new(v.n);
-    let link = |&i: &u32| {
-        let mut out = Vec::with_capacity(26);
-        around.visit(i as usize, |k, j| {
-            if slots[j] != u32::MAX {
-                out.push((slots[j], weight[k]));
-            }
-        });
-        out
-    };
-    voxels.iter().map(link).collect()
+/// The 26-neighbours of each voxel within a component, with step lengths in [`UNIT_MM`].
+struct Links {
+    /// Where each voxel's neighbours begin, and their end.
+    first: Vec<usize>,
+    /// Neighbour and step.
+    steps: Vec<(u32, u32)>,
+    /// The longest step.
+    longest: u32,
 }
 
+impl Links {
+    fn new(v: &Volume, voxels: &[u32], slots: &[u32]) -> Self {
+        let weight = NEIGHBOURS.map(|d| {
+            let l = (0..3).map(|a| (f64::from(d[a]) * v.step[a]).powi(2)).sum::<f64>().sqrt();
+            (l / UNIT_MM).round().max(1.0) as u32
+        });
+        let around = Around::new(v.n);
+        let (mut first, mut steps) = (Vec::with_capacity(voxels.len() + 1), Vec::with_capacity(16 * voxels.len()));
+        for &i in voxels {
+            first.push(steps.len());
+            around.visit(i as usize, |k, j| {
+                if slots[j] != u32::MAX {
+                    steps.push((slots[j], weight[k]));
+                }
+            });
+        }
+        first.push(steps.len());
+        Self { first, steps, longest: weight.into_iter().max().unwrap_or(1) }
+    }
+
+    fn len(&self) -> usize {
+        self.first.len() - 1
+    }
+
+    fn of(&self, i: u32) -> &[(u32, u32)] {
+        &self.steps[self.first[i as usize]..self.first[i as usize + 1]]
+    }
+}
+
+/// Shortest ways from `root` along the links (Dijkstra; steps are small whole numbers, so that a ring of lists by distance
+/// takes the place of a heap: Dial 1969).
 fn geodesic(links: &Links, root: usize) -> Vec<u32> {
     let mut d = vec![u32::MAX; links.len()];
-    let mut heap = std::collections::BinaryHeap::from([(std::cmp::Reverse(0u32), root as u32)]);
+    let mut ring = vec![Vec::new(); links.longest as usize + 1];
+    let (mut here, mut waiting, mut at) = (vec![root as u32], 1, 0_u32);
     d[root] = 0;
-    while let Some((std::cmp::Reverse(at), i)) = heap.pop() {
-        if d[i as usize] < at {
-            continue;
-        }
-        for &(j, w) in &links[i as usize] {
-            if d[j as usize] > at + w {
-                d[j as usize] = at + w;
-                heap.push((std::cmp::Reverse(at + w), j));
+    while waiting > 0 {
+        waiting -= here.len();
+        for i in here.drain(..) {
+            // one that was reached by a shorter way meanwhile has been there already
+            if d[i as usize] < at {
+                continue;
+            }
+            for &(j, w) in links.of(i) {
+                if d[j as usize] > at + w {
+                    d[j as usize] = at + w;
+                    ring[(at + w) as usize % (links.longest as usize + 1)].push(j);
+                    waiting += 1;
+                }
             }
         }
+        at += 1;
+        std::mem::swap(&mut here, &mut ring[at as usize % (links.longest as usize + 1)]);
     }
     d
 }
@@ -250,7 +278,7 @@ fn geodesic(links: &Links, root: usize) -> Vec<u32> {
 /// Persistence of every maximum of `d` (superlevel sets joined in falling order); the highest keeps its whole height.
 fn persistence(links: &Links, d: &[u32]) -> Vec<u32> {
     let mut order: Vec<u32> = (0..d.len() as u32).collect();
-    order.sort_by_key(|&i| (std::cmp::Reverse(d[i as usize]), i));
+    order.sort_unstable_by_key(|&i| (std::cmp::Reverse(d[i as usize]), i));
     let mut parent = vec![u32::MAX; d.len()];
     let mut out = Vec::new();
     fn top(parent: &mut [u32], mut i: u32) -> u32 {
@@ -262,7 +290,7 @@ fn persistence(links: &Links, d: &[u32]) -> Vec<u32> {
     }
     for i in order {
         parent[i as usize] = i;
-        for &(j, _) in &links[i as usize] {
+        for &(j, _) in links.of(i) {
             if parent[j as usize] == u32::MAX {
                 continue;
             }
