@@ -3,7 +3,8 @@
 //! A job moves queued -> running -> succeeded | failed | cancelled. A claim adds one to `fence` and `attempt`; every
 //! later write of the worker carries `id`, `fence` and `state = 'running'`, and no row touched means that the lease
 //! was lost: the worker stops and drops its files. Each change and its event commit together, so a reader who has
-//! seen event N has seen everything before it. Rejected: the queue library apalis 1.0, which started a poison job of
+//! seen event N has seen everything before it; triggers on the row see to that, and to what follows an end (retention,
+//! webhooks: migrations 0007, docs/adr/0075). Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
 //! `submit`, `several`, `gather`, `read` and `results` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
