@@ -17,7 +17,7 @@ use implicit::{Draws, Field, Sampled, Smoothing, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
 use skeleton::{CapHint, MedialGraph};
-use space::{FaultKind, Faulty, P3, Warning};
+use space::{FaultKind, Faulty, P3, Place, Warning};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use surface::{
@@ -101,9 +101,12 @@ fn reconstruct(
         Ok::<_, MeshFault>((sampled, image.kept(&ends), ends))
     })?;
     contours.cuts.extend(&ends.cuts);
+    let mut seeds = Seeds::new(&f, &contours, &ends);
+    let wall = steps.step("mesh", |ctx| {
+        let given = ends.cuts.len();
+        rimmed(&f, (&mut seeds, &ends), &image, (&mut contours, given), plan, ctx)
+    })?;
     let contours = contours;
-    let seeds = Seeds::new(&f, &contours, &ends);
-    let wall = steps.step("mesh", |ctx| wall(&f, &seeds, image, &contours, plan, ctx))?;
     let (graph, medial, patched) = steps.step("skeleton", |ctx| {
         let (graph, medial) = medial_lines(&sampled, &seeds.inner, &contours, &wall, &ctx.part(0.0, 0.8))?;
         let patched = patches::patched(&wall, &contours, &graph, &ctx.part(0.8, 1.0))?;
@@ -257,11 +260,51 @@ const ATTEMPTS: usize = 6;
 /// Factor on sigma between attempts.
 const RETREAT: f64 = 0.75;
 
-/// The finished wall: smoothed, cut at the data's ends, capped, remeshed, measured.
+/// How far a plane at which the data end is moved inward at once, and at most, mm.
+const INWARD_MM: [f64; 2] = [1.0, 4.0];
+
+/// The finished wall. Where the data end in a plane that only grazes a vessel there is no rim to speak of: that plane is
+/// moved inward, with a warning; not one of the `given` cuts, which are the last and which the plan asks for.
+fn rimmed(
+    f: &Variational,
+    (seeds, ends): (&mut Seeds, &Ends),
+    image: &Image,
+    (contours, given): (&mut Contours, usize),
+    plan: &Plan,
+    ctx: &Ctx,
+) -> Result<Wall, MeshFault> {
+    let first = contours.cuts.len() - given;
+    let mut inward = vec![(0.0, Place::default()); first];
+    loop {
+        let fault = match wall(f, seeds, image, contours, plan, ctx) {
+            Err(MeshFault::Surface(e)) => e,
+            Ok(mut wall) => {
+                let moved = inward.into_iter().filter(|(mm, _)| *mm > 0.0);
+                wall.warnings.extend(moved.map(|(mm, place)| Warning {
+                    code: "ends.inward",
+                    message: format!(
+                        "the data end where a vessel's wall only grazes the plane of their end: all vessels are cut {mm:.0} mm further in there"
+                    ),
+                    place,
+                }));
+                return Ok(wall);
+            }
+            other => return other,
+        };
+        let room = |plane: &usize| inward.get(*plane).is_some_and(|(mm, _)| *mm < INWARD_MM[1]);
+        let Some(plane) = fault.without_rim().filter(room) else { return Err(fault.into()) };
+        inward[plane] = (inward[plane].0 + INWARD_MM[0], fault.place());
+        let cut = &mut contours.cuts[plane];
+        cut.point = cut.point - cut.outward * INWARD_MM[0];
+        *seeds = Seeds::new(f, contours, ends);
+    }
+}
+
+/// The wall: smoothed, cut at the data's ends, capped, remeshed, measured.
 fn wall(
     f: &Variational,
     seeds: &Seeds,
-    image: Image,
+    image: &Image,
     contours: &Contours,
     plan: &Plan,
     ctx: &Ctx,
@@ -276,12 +319,12 @@ fn wall(
         limit = report.sigma_mm * RETREAT;
         let shell = match shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9)) {
             // two lumens that all but touch: another smoothing parts or joins them
-            Err(e) if is_unresolved(&e) => continue,
+            Err(e) if e.is_unresolved() => continue,
             shell => shell?,
         };
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
         if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            let back = TriMesh { vertices: image.wall, ..TriMesh::default() };
+            let back = TriMesh { vertices: image.wall.clone(), ..TriMesh::default() };
             let back = surface::displacement(&back, &field, contours.pixel_mm, ctx)?;
             let moved = moved.max(back.max_mm.max(-back.min_mm));
             return Ok(measured(shell, field, moved, plan, &ctx.part(0.9, 1.0))?);
@@ -289,7 +332,7 @@ fn wall(
     }
     let shell = shell_of(&image.sampled, (f, seeds), contours, plan, &ctx.part(0.0, 0.9))?;
     let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
-    Ok(measured(shell, image.sampled, moved, plan, &ctx.part(0.9, 1.0))?)
+    Ok(measured(shell, image.sampled.clone(), moved, plan, &ctx.part(0.9, 1.0))?)
 }
 
 /// The capped and remeshed surface and how far it lies from the zero level of f as it was fitted.
@@ -299,15 +342,6 @@ struct Shell {
     displacement: Displacement,
 }
 
-/// Times that the polygoniser's cell is halved where it missed a turn of the wall, as between two arteries that part: the
-/// mesh then joins what f separates, or the reverse, and no remeshing can lay it on f.
-const HALVINGS: i32 = 2;
-
-/// Whether a mesh was too coarse for the wall, or the wall is all but singular there.
-fn is_unresolved(e: &surface::Error) -> bool {
-    matches!(e, surface::Error::Folded { .. } | surface::Error::CrossedRim { .. })
-}
-
 fn shell_of(
     field: &Sampled,
     (f, seeds): (&Variational, &Seeds),
@@ -315,20 +349,15 @@ fn shell_of(
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<Shell, surface::Error> {
-    let by = |halvings: i32, ctx: &Ctx| {
-        let cell_mm = contours.pixel_mm * 0.5_f64.powi(halvings);
-        let cell = PolygoniseSettings { cell_mm, ..PolygoniseSettings::default() };
-        let (rough, _) = surface::polygonise(&bounded(field, contours), &seeds.wall, &cell, &ctx.part(0.0, 0.1))?;
-        let (cut, report) = surface::cut(&rough, field, &contours.cuts, &ctx.part(0.1, 0.2))?;
-        Ok((remeshed(&cut, field, contours, plan, &ctx.part(0.2, 1.0))?, report.caps))
+    let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
+    let settings = RemeshSettings {
+        edge_mm: plan.surface.edge_mm,
+        max_error_mm: plan.surface.max_error_mm,
+        sizing: Sizing::Curvature,
+        ..RemeshSettings::default()
     };
-    let mut meshed = by(0, &ctx.part(0.0, 0.8));
-    for halvings in 1..=HALVINGS {
-        if meshed.as_ref().is_err_and(is_unresolved) {
-            meshed = by(halvings, &ctx.part(0.0, 0.8));
-        }
-    }
-    let (mesh, caps) = meshed?;
+    let surface::Shell { mesh, caps, .. } =
+        surface::shell(field, &seeds.wall, &contours.cuts, &cell, &settings, &ctx.part(0.0, 0.8))?;
     let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 1.0))?;
     Ok(Shell { mesh, caps, displacement })
 }
@@ -343,22 +372,6 @@ fn measured(shell: Shell, field: Sampled, hausdorff_mm: f64, plan: &Plan, ctx: &
     let beside = beside(&mesh, &caps);
     let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
     Ok(Wall { mesh, caps, beside, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
-}
-
-fn remeshed(
-    cut: &TriMesh,
-    field: &Sampled,
-    contours: &Contours,
-    plan: &Plan,
-    ctx: &Ctx,
-) -> Result<TriMesh, surface::Error> {
-    let settings = RemeshSettings {
-        edge_mm: plan.surface.edge_mm,
-        max_error_mm: plan.surface.max_error_mm,
-        sizing: Sizing::Curvature,
-        ..RemeshSettings::default()
-    };
-    surface::remesh(cut, field, &contours.cuts, &settings, ctx).map(|(mesh, _)| mesh)
 }
 
 /// Flow extensions at every cap. They are for solvers: where one has no room the numbers of the scan still stand, so

@@ -233,6 +233,23 @@ impl From<exec::Cancelled> for Error {
     }
 }
 
+impl Error {
+    /// Whether a mesh was too coarse for the wall, or the wall is all but singular there.
+    pub fn is_unresolved(&self) -> bool {
+        matches!(self, Self::Folded { .. } | Self::CrossedRim { .. })
+    }
+
+    /// The plane (as given) at which the wall has no rim that could be closed: another one a little away may.
+    pub fn without_rim(&self) -> Option<usize> {
+        match self {
+            Self::GrazingCut { plane, .. } | Self::CrossedRim { plane, .. } | Self::NestedRims { plane, .. } => {
+                Some(*plane)
+            }
+            _ => None,
+        }
+    }
+}
+
 impl Faulty for Error {
     fn kind(&self) -> FaultKind {
         match self {

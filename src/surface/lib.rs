@@ -1,8 +1,8 @@
 //! The implicit function to triangles: polygonise, project, cut and cap, remesh, distances, patches, checks.
 //!
-//! f = 0 on the wall, f > 0 in the lumen. The usual way: [`polygonise`] of the field [`Bounded`] by the planes at which
-//! the data end, from the contour points; [`cut`] of the raw mesh by those planes, with the field itself; [`remesh`] with
-//! the planes, which lands every wall vertex on f = 0; then [`check`], [`self_intersections`], [`quality`],
+//! f = 0 on the wall, f > 0 in the lumen. The usual way is [`shell`]: [`polygonise`] of the field [`Bounded`] by the planes
+//! at which the data end, from the contour points; [`cut`] of the raw mesh by those planes, with the field itself;
+//! [`remesh`] with the planes, which lands every wall vertex on f = 0. Then [`check`], [`self_intersections`], [`quality`],
 //! [`displacement`] and [`patches`]. [`project`] is for those who want the raw mesh on f = 0 without remeshing.
 
 mod cap;
@@ -28,6 +28,7 @@ mod quads;
 mod quality;
 mod remesh;
 mod ring;
+mod shell;
 mod sizing;
 mod sparse;
 #[cfg(test)]
@@ -48,4 +49,5 @@ pub use polygonise::{PolygoniseReport, PolygoniseSettings, polygonise};
 pub use quads::{QuadSettings, Quads, quads};
 pub use quality::{Quality, quality};
 pub use remesh::{RemeshReport, RemeshSettings, Sizing, remesh};
+pub use shell::{Shell, shell};
 pub use topology::{Defect, DefectKind, Topology, check, topology};

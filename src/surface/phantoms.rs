@@ -59,7 +59,14 @@ pub(crate) fn phantom(dice: &mut Dice, kind: usize) -> Phantom {
                 (V3::new(angle.sin(), 0.0, angle.cos()), 12.0, r),
             ];
             let field = fields::tree(branches, vec![1.0, 1.5]);
-            Phantom { field, seed: P3::new(0.0, 0.0, 13.6), cuts: ends(9.0), euler: 2, branches: 3, sections: vec![] }
+            Phantom {
+                field,
+                seed: P3::new(1.6, 0.85, -4.925),
+                cuts: ends(9.0),
+                euler: 2,
+                branches: 3,
+                sections: vec![],
+            }
         }
         _ => {
             let (a, b) = (dice.between(0.7, 1.2), dice.between(0.7, 1.2));
@@ -70,7 +77,7 @@ pub(crate) fn phantom(dice: &mut Dice, kind: usize) -> Phantom {
                 (V3::new(-b.sin(), 0.1, b.cos()).normalised().unwrap_or(V3::Y), 12.0, dice.between(1.1, 1.6)),
             ];
             let field = fields::tree(branches, vec![1.0, 1.0, 1.5]);
-            Phantom { field, seed: P3::new(0.0, 0.0, -13.8), cuts: ends(7.0), euler: 2, branches: 4, sections: vec![] }
+            Phantom { field, seed: P3::new(1.8, 0.0, -5.0), cuts: ends(7.0), euler: 2, branches: 4, sections: vec![] }
         }
     }
 }

@@ -97,10 +97,22 @@ pub fn remesh(
     settings: &RemeshSettings,
     ctx: &Ctx,
 ) -> Result<(TriMesh, RemeshReport), Error> {
+    thinned(mesh, field, cuts, settings, THIN, ctx)
+}
+
+/// [`remesh`] of a raw mesh that is first thinned out to `thin` times its mean edge.
+pub(crate) fn thinned(
+    mesh: &TriMesh,
+    field: &dyn Field,
+    cuts: &[CutPlane],
+    settings: &RemeshSettings,
+    thin: f64,
+    ctx: &Ctx,
+) -> Result<(TriMesh, RemeshReport), Error> {
     let rule = rule(settings)?;
     let mut fabric = Fabric::new(mesh, field, cap_planes(mesh, cuts)?)?;
     let longest = rule.edge_mm[1];
-    start(&mut fabric, &rule, ctx)?;
+    start(&mut fabric, &rule, thin, ctx)?;
     for round in 0..settings.iterations {
         ctx.progress(0.8 * round as f64 / settings.iterations as f64);
         if round == LANDING_ROUND {
@@ -132,17 +144,17 @@ pub fn remesh(
 const RAW: f64 = 0.02;
 /// Raw meshes are thinned out to this times their mean edge (.3 mm at a cell of .5 mm): the second derivatives are then
 /// asked for at 1.1 times the final number of vertices, at 1 it was 2.8 times.
-const THIN: f64 = 1.6;
+pub(crate) const THIN: f64 = 1.6;
 /// Cotangent of 20 degrees.
 const SLIVER: f64 = 2.75;
 
 /// First landing and sizes. A raw lattice mesh has two to three times the vertices that are wanted: it is thinned out
 /// before f is asked.
-fn start(fabric: &mut Fabric<'_>, rule: &Rule, ctx: &Ctx) -> Result<(), Error> {
+fn start(fabric: &mut Fabric<'_>, rule: &Rule, thin: f64, ctx: &Ctx) -> Result<(), Error> {
     let n = fabric.web.face_id.len();
     let slivers = (0..n).filter(|&t| fabric.worth_at(3 * t as u32).cot > SLIVER).count();
     if slivers as f64 > RAW * n as f64 {
-        thin_out(fabric, THIN, ctx)?;
+        thin_out(fabric, thin, ctx)?;
     }
     if let Sizing::Uniform(h) = rule.sizing {
         fabric.size.fill(h);

@@ -42,6 +42,24 @@ fn twenty_phantoms_and_shifts_are_closed_and_well_shaped() {
     }
 }
 
+/// Its third branch ends in a tip that the upper plane clips: the rim's area is .2 mm2.
+#[test]
+fn a_tip_that_a_plane_only_just_clips_gets_a_finer_lattice() {
+    let ctx = Ctx::new(2).unwrap();
+    let mut dice = Dice(139 * 977 + 1);
+    let p = phantom(&mut dice, 139);
+    let cell = PolygoniseSettings { shift: [dice.roll(), dice.roll(), dice.roll()], ..PolygoniseSettings::default() };
+    let settings = RemeshSettings { max_error_mm: MAX_ERROR_MM, ..RemeshSettings::default() };
+    let found = shell(&p.field, &[p.seed], &p.cuts, &cell, &settings, &ctx).unwrap();
+    assert_eq!((found.halvings, found.caps.len()), (1, 4));
+    assert_eq!(check(&found.mesh).unwrap().euler, 2);
+    assert!(self_intersections(&found.mesh, &ctx).unwrap().is_empty());
+    let smallest = found.caps.iter().map(|c| c.area_mm2).fold(f64::INFINITY, f64::min);
+    assert!(smallest < 0.3, "{smallest}");
+    let q = quality(&found.mesh, &p.field, &ctx).unwrap();
+    assert!(q.min_angle_deg >= 30.0 && q.max_angle_deg <= 120.0 && q.vertex_max_mm <= 1e-9, "{q:?}");
+}
+
 #[test]
 fn one_and_three_threads_give_the_same_bytes() {
     let mesh = |threads| {

@@ -45,11 +45,17 @@ pub(crate) fn fault(reason: String, at: DVec3) -> Error {
     Error::Patches { reason, at: P3::from_raw(at) }
 }
 
-/// Divide the wall of a closed mesh with caps.
+/// Divide the wall of a closed mesh with caps; another `attempt` divides its junctions in another way.
 ///
 /// # Errors
 /// [`Error::Patches`] where no division into annuli was found, [`Error::PatchSolve`], [`Error::Cancelled`].
-pub(crate) fn layout(mesh: &TriMesh, field: &dyn Field, sections: &[Flat], ctx: &Ctx) -> Result<Layout, Error> {
+pub(crate) fn layout(
+    mesh: &TriMesh,
+    field: &dyn Field,
+    sections: &[Flat],
+    attempt: usize,
+    ctx: &Ctx,
+) -> Result<Layout, Error> {
     let caps = mesh.face_id.iter().copied().max().unwrap_or(WALL);
     let mut rim = BTreeMap::new();
     for (tri, &id) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id != WALL) {
@@ -79,7 +85,7 @@ pub(crate) fn layout(mesh: &TriMesh, field: &dyn Field, sections: &[Flat], ctx: 
             cap.or(section_of.get(&root).copied()).unwrap_or(0)
         };
         let branches: Vec<u32> = piece.loops().iter().map(|ring| branch(ring, &piece)).collect();
-        divide(piece, field, &branches, &mut fresh, &mut out, ctx)?;
+        divide(piece, field, (&branches, attempt), &mut fresh, &mut out, ctx)?;
     }
     Ok(out)
 }
@@ -121,7 +127,7 @@ fn section(sheet: &Sheet, plane: &Flat, taken: &BTreeSet<(u32, u32)>) -> Option<
 fn divide(
     piece: Sheet,
     field: &dyn Field,
-    branches: &[u32],
+    (branches, attempt): (&[u32], usize),
     fresh: &mut u32,
     out: &mut Layout,
     ctx: &Ctx,
@@ -140,7 +146,7 @@ fn divide(
             out.regions.push(Region { sheet: piece, ends, branch });
             Ok(())
         }
-        _ => star((&piece, field), &loops, branches, fresh, out, ctx),
+        _ => star((&piece, field), &loops, (branches, attempt), fresh, out, ctx),
     }
 }
 
@@ -148,7 +154,7 @@ fn divide(
 fn star(
     (piece, field): (&Sheet, &dyn Field),
     loops: &[Vec<u32>],
-    branches: &[u32],
+    (branches, attempt): (&[u32], usize),
     fresh: &mut u32,
     out: &mut Layout,
     ctx: &Ctx,
@@ -174,19 +180,19 @@ fn star(
     let radius = loops.iter().map(girth).fold(f64::INFINITY, f64::min) / std::f64::consts::TAU;
     let star = Star { piece, field, h, hole, branches, time: (FLOW * radius).powi(2) };
     let base = conductances(piece, &star.h);
-    let mut best = star.divided(base.clone(), *fresh, ctx)?;
+    let mut found: Vec<Divided> = star.divided(base.clone(), *fresh, ctx)?.into_iter().collect();
     // With four vessels or more in a plane two poles may all but meet: one vessel a little heavier keeps them apart.
-    let heavier = HEAVIER.iter().flat_map(|&by| (0..k).map(move |i| (i, by))).filter(|_| k > 3);
-    for (i, by) in heavier {
+    let heavier = HEAVIER.iter().flat_map(|&by| (0..k).map(move |i| (i, by)));
+    for (i, by) in heavier.filter(|_| k > 3 || attempt > 0) {
         ctx.check()?;
         let mut weigh = base.clone();
         weigh[i] -= by;
-        let other = star.divided(weigh, *fresh, ctx)?;
-        let shortest = |d: &Option<Divided>| d.as_ref().map_or(0.0, |d| d.shortest);
-        if shortest(&other) > shortest(&best) {
-            best = other;
-        }
+        found.extend(star.divided(weigh, *fresh, ctx)?);
     }
+    if k > 3 {
+        found.sort_by(|a, b| b.shortest.total_cmp(&a.shortest));
+    }
+    let best = found.into_iter().nth(attempt);
     let Some(divided) = best else {
         let at = loops.iter().fold(DVec3::ZERO, |s, ring| s + piece.place(ring[0])) / k as f64;
         return Err(fault(format!("no division of a junction of {k} vessels into one annulus for each was found"), at));

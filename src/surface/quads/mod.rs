@@ -107,9 +107,33 @@ pub fn quads(
     crate::web::Web::weave(mesh)?;
     let planes = cap_planes(mesh, cuts)?;
     let sections: Vec<Flat> = sections.iter().filter_map(Flat::of).collect();
-    let layout = layout::layout(mesh, field, &sections, ctx)?;
+    let mut first = None;
+    for attempt in 0..ATTEMPTS {
+        match woven((mesh, field), (&planes, &sections), attempt, settings, ctx) {
+            Ok(Ok(out)) => return Ok(out),
+            Ok(Err(marks)) => first = first.or(Some(unsettled(&marks))),
+            // no other division
+            Err(Error::Patches { .. }) if first.is_some() => break,
+            Err(e) => return Err(e),
+        }
+    }
+    Err(first.unwrap_or_else(|| unsettled(&[])))
+}
+
+/// Other divisions are tried where the first one's patches do not settle, one wall in some hundreds.
+const ATTEMPTS: usize = 4;
+
+/// Patches on one division of the wall, or what was measured last of those that halving does not mend.
+fn woven(
+    (mesh, field): (&TriMesh, &dyn Field),
+    (planes, sections): (&[Flat], &[Flat]),
+    attempt: usize,
+    settings: &QuadSettings,
+    ctx: &Ctx,
+) -> Result<Result<Quads, Vec<Mark>>, Error> {
+    let layout = layout::layout(mesh, field, sections, attempt, ctx)?;
     let charts = ctx.map(&layout.regions, |r| Chart::new(r, ctx))?.into_iter().collect::<Result<Vec<_>, _>>()?;
-    let mut weave = Weave::new(&layout, charts, &planes)?;
+    let mut weave = Weave::new(&layout, charts, planes)?;
     first_rows(&mut weave);
     let basis = Basis::new(settings.order);
     let mut last = Vec::new();
@@ -119,13 +143,13 @@ pub fn quads(
         last = ctx.map(&tissue.cells, |c| tissue.mark(c, field, &basis))?;
         if let Some(out) = settle(&mut weave, &tissue, &last, settings) {
             ctx.progress(1.0);
-            return Ok(out);
+            return Ok(Ok(out));
         }
         if weave.patches() > settings.max_quads {
             break;
         }
     }
-    Err(unsettled(&last))
+    Ok(Err(last))
 }
 
 /// Halving did not help: where and how far from it.
