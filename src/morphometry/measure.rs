@@ -478,7 +478,7 @@ fn branch(tracks: &[Track], t: usize, known: &Known<'_>, varied: Option<&Varied>
     let (first, last) = (&track.sections[0], &track.sections[track.sections.len() - 1]);
     let chord = first.position.distance(last.position);
     let helix = fitted(&track.centred());
-    let diameter_mm = track.area_radius(|_| true).map(|r| 2.0 * r);
+    let diameter_mm = track.diameter();
     Branch {
         id: track.id,
         role,
@@ -530,6 +530,14 @@ fn warn_sections(tracks: &[Track], warnings: &mut Vec<Warning>) {
                 t.id
             );
             warnings.push(Warning::new("sections.outside", message, Place::element(t.id)));
+        }
+        if t.diameter().is_none() {
+            let message = format!(
+                "branch {} has {:.1} mm of sections clear of junctions, openings and blind ends, less than its radius: it has no diameter",
+                t.id,
+                t.span()
+            );
+            warnings.push(Warning::new("sections.short", message, Place::element(t.id)));
         }
     }
 }

@@ -38,6 +38,8 @@ pub(crate) struct Track {
     pub(crate) to_node: usize,
     /// Ends that close inside the data without a cap, first and last.
     pub(crate) tip: [bool; 2],
+    /// Ends at junctions, first and last.
+    joint: [bool; 2],
     /// The graph's line, resampled and smoothed.
     pub(crate) medial: Vec<DVec3>,
     pub(crate) sections: Vec<Section>,
@@ -85,6 +87,20 @@ impl Track {
     pub(crate) fn area_radius(&self, admit: impl Fn(f64) -> bool) -> Option<f64> {
         let usable = (0..self.sections.len()).filter(|&k| self.usable(k) && admit(self.sections[k].abscissa_mm));
         median(usable.filter_map(|k| self.sections[k].radius_area_mm()).collect())
+    }
+
+    /// Median area-equivalent diameter, mm. None where the usable sections lie within a radius: whether a junction swells
+    /// them is not known then.
+    pub(crate) fn diameter(&self) -> Option<f64> {
+        let radius = self.area_radius(|_| true)?;
+        (self.span() >= radius).then_some(2.0 * radius)
+    }
+
+    /// Length from the first usable section to the last, mm.
+    pub(crate) fn span(&self) -> f64 {
+        let usable: Vec<usize> = (0..self.sections.len()).filter(|&k| self.usable(k)).collect();
+        let at = |k: Option<&usize>| k.map_or(0.0, |&k| self.sections[k].abscissa_mm);
+        at(usable.last()) - at(usable.first())
     }
 
     /// Centres of the usable sections, in order.
@@ -177,7 +193,26 @@ impl Track {
                 self.leak[k] |= ratio > LEAK_RATIO * usual;
             }
         }
+        for end in 0..2 {
+            self.find_swelling(end);
+        }
         self.reset_junction();
+    }
+
+    /// Flags the sections that a junction swells, whatever the angles say of how far the lumens overlap: of a branch that is
+    /// hardly longer than that its direction is not known, and with it the angles are not.
+    fn find_swelling(&mut self, end: usize) {
+        if !self.joint[end] {
+            return;
+        }
+        let n = self.sections.len();
+        let index = |i: usize| if end == 0 { i } else { n - 1 - i };
+        let way = |i: usize| self.sections[index(i)].abscissa_mm;
+        let from_end: Vec<f64> = (0..n).map(|i| (way(i) - way(0)).abs()).collect();
+        let areas: Vec<Option<f64>> = (0..n).map(|i| self.sections[index(i)].area_mm2).collect();
+        if let Some(last) = skeleton::swelling(&areas, &from_end, self.own_radius(), false) {
+            (0..=last).for_each(|i| self.leak[index(i)] = true);
+        }
     }
 
     /// Abscissas along the smoothed centred line.
@@ -300,7 +335,8 @@ fn track(graph: &MedialGraph, id: usize) -> Result<Track, Error> {
     let once = local_positions(&at, &sampled);
     let (at, sampled) = even(&once, &sampled.iter().map(|p| p.1).collect::<Vec<_>>(), typical);
     let tip = [from, to].map(|n| kind(n) == NodeKind::End && graph.nodes[n].cap.is_none());
-    Ok(smoothed(id, [from, to], tip, &at, &sampled))
+    let joint = [from, to].map(|n| kind(n) == NodeKind::Junction);
+    Ok(Track { tip, joint, ..smoothed(id, [from, to], &at, &sampled) })
 }
 
 /// Points and radii at even arc lengths.
@@ -329,7 +365,7 @@ fn local_positions(at: &[f64], sampled: &[(DVec3, f64)]) -> Vec<DVec3> {
     (0..raw.len()).map(fit).collect()
 }
 
-fn smoothed(id: usize, nodes: [usize; 2], tip: [bool; 2], at: &[f64], sampled: &[(DVec3, f64)]) -> Track {
+fn smoothed(id: usize, nodes: [usize; 2], at: &[f64], sampled: &[(DVec3, f64)]) -> Track {
     let raw: Vec<DVec3> = sampled.iter().map(|p| p.0).collect();
     let ones = vec![1.0; raw.len()];
     let line = Samples { s: at, points: &raw, weight: &ones };
@@ -364,7 +400,8 @@ fn smoothed(id: usize, nodes: [usize; 2], tip: [bool; 2], at: &[f64], sampled: &
         id,
         from_node: nodes[0],
         to_node: nodes[1],
-        tip,
+        tip: [false; 2],
+        joint: [false; 2],
         medial,
         sections,
         ratio: vec![None; n],

@@ -202,34 +202,40 @@ fn take_sections(
 /// Drop the sections of the line's first (end 0) or last part that lie within a junction of inscribed radius `radius`.
 fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius: f64) {
     let n = sections.len();
-    let length = s[n - 1];
     let index = |i: usize| if end == 0 { i } else { n - 1 - i };
-    let from_end = |i: usize| if end == 0 { s[i] } else { length - s[n - 1 - i] };
-    let area = |sections: &[Option<Section>], i: usize| sections[index(i)].as_ref().map(|x| x.area);
+    let from_end: Vec<f64> = (0..n).map(|i| if end == 0 { s[i] } else { s[n - 1] - s[n - 1 - i] }).collect();
+    let areas: Vec<Option<f64>> = (0..n).map(|i| sections[index(i)].as_ref().map(|x| x.area)).collect();
+    if let Some(last) = swelling(&areas, &from_end, radius, true) {
+        (0..=last).for_each(|i| sections[index(i)] = None);
+    }
+}
+
+/// The last section, counted from a junction of inscribed radius `radius` outward, that is swollen by it: larger than the
+/// median of those one to three radii farther out by [`SWELLING`]. `areas` and the distances `from_end`, mm, are in that
+/// order; where `missing` is set a section without area counts as swollen, unless it lies behind all others.
+pub fn swelling(areas: &[Option<f64>], from_end: &[f64], radius: f64, missing: bool) -> Option<usize> {
     let mut last = None;
     // sections that are missing behind all others are open at a cap, not leaking at the junction
-    let Some(outermost) = (0..n).rev().find(|&i| area(sections, i).is_some()) else { return };
-    for i in (0..outermost).take_while(|&i| from_end(i) < SWELLING_RADII * radius) {
-        if from_end(i) > CALM_RADII * radius + last.map_or(0.0, from_end) {
+    let outermost = areas.iter().rposition(Option::is_some)?;
+    for i in (0..outermost).take_while(|&i| from_end[i] < SWELLING_RADII * radius) {
+        if from_end[i] > CALM_RADII * radius + last.map_or(0.0, |l: usize| from_end[l]) {
             break;
         }
-        let Some(a) = area(sections, i) else {
-            last = Some(i);
+        let Some(a) = areas[i] else {
+            last = if missing { Some(i) } else { last };
             continue;
         };
         let r = (a / std::f64::consts::PI).sqrt();
-        let mut outward: Vec<f64> = (i + 1..n)
-            .filter(|&j| from_end(j) > from_end(i) + r && from_end(j) <= from_end(i) + 3.0 * r)
-            .filter_map(|j| area(sections, j))
+        let mut outward: Vec<f64> = (i + 1..areas.len())
+            .filter(|&j| from_end[j] > from_end[i] + r && from_end[j] <= from_end[i] + 3.0 * r)
+            .filter_map(|j| areas[j])
             .collect();
         outward.sort_by(f64::total_cmp);
         if outward.get(outward.len() / 2).is_some_and(|&median| a > SWELLING * median) {
             last = Some(i);
         }
     }
-    if let Some(last) = last {
-        (0..=last).for_each(|i| sections[index(i)] = None);
-    }
+    last
 }
 
 /// Junctions to the point nearest to their branches' axes; free ends and the bases of closed lines to their centroids.
@@ -320,7 +326,7 @@ fn on_trunk(junction: P3, at: &[(usize, usize)], lines: &[Line], thinner: f64) -
 /// the divider. `None` for a branch that joins a vessel which runs on, and where the crossing is nearer than that.
 fn division(crossing: P3, at: &[(usize, usize)], lines: &[Line], lumen: &Lumen<'_>) -> Option<P3> {
     let &[a, b, c] = at else { return None };
-    let radius = |branch: (usize, usize)| lines[branch.0].radius;
+    let radius = |(e, end): (usize, usize)| own_radius(&lines[e], end);
     let mut order = [a, b, c];
     order.sort_by(|x, y| radius(*x).total_cmp(&radius(*y)));
     let [first, second, trunk] = order;
@@ -347,6 +353,19 @@ fn division(crossing: P3, at: &[(usize, usize)], lines: &[Line], lumen: &Lumen<'
         point = divider + upstream * lumen.inscribed(point)?;
     }
     (point.distance(divider) < crossing.distance(divider) && lumen.contains(point)).then_some(point)
+}
+
+/// Median area-equivalent radius of a line's good sections next to one end: the inscribed radius halfway along a short
+/// branch may be the junction's, and that of a voxel line off its axis a quarter too small.
+fn own_radius(line: &Line, end: usize) -> f64 {
+    let mut good: Vec<&Section> = line.sections.iter().flatten().collect();
+    if end == 1 {
+        good.reverse();
+    }
+    let near = good.iter().take_while(|s| s.centre.distance(good[0].centre) <= 2.0 * AXIS_RADII * line.radius);
+    let mut radii: Vec<f64> = near.map(|s| (s.area / std::f64::consts::PI).sqrt()).collect();
+    radii.sort_by(f64::total_cmp);
+    radii.get(radii.len() / 2).copied().unwrap_or(line.radius)
 }
 
 /// The straight line through the good centres next to one end of a line: centroid and unit direction.

@@ -7,6 +7,7 @@ use crate::cut::loops;
 use crate::land::Flat;
 use crate::web::{NONE, Web};
 use crate::{Error, TriMesh, WALL};
+use glam::DVec3;
 use space::P3;
 use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
 use std::collections::BTreeMap;
@@ -158,11 +159,21 @@ fn left_of_outline(faces: &[[usize; 3]], n: usize) -> Vec<[usize; 3]> {
 ///
 /// Beyond the data a variational function may go anywhere. Polygonising this field instead keeps the surface within
 /// `margin_mm` of the cut planes; within the planes, and up to the margin outside, it is f itself, so [`crate::cut`] by
-/// the same planes gives the same result as without it. Not smooth at the margin: do not remesh on it.
+/// the same planes gives the same result as without it. Past a plane what is out of the data's box counts as farther out by
+/// its distance from the box: a vessel that leaves through the end slice at a few degrees runs far beyond its last
+/// contour there, all of it past the plane. Not smooth at the margin: do not remesh on it.
 pub struct Bounded<'a> {
     field: &'a dyn implicit::Field,
     flats: Vec<Flat>,
     margin_mm: f64,
+}
+
+/// Where the field is closed.
+struct Room {
+    /// Distance to there, mm; negative beyond.
+    mm: f64,
+    /// Its gradient.
+    gradient: DVec3,
 }
 
 impl<'a> Bounded<'a> {
@@ -170,10 +181,18 @@ impl<'a> Bounded<'a> {
     pub fn new(field: &'a dyn implicit::Field, cuts: &[imaging::CutPlane], margin_mm: f64) -> Self {
         Self { field, flats: cuts.iter().filter_map(Flat::of).collect(), margin_mm }
     }
-    /// The plane that is nearest to being left, and the distance to its margin.
-    fn nearest(&self, x: P3) -> Option<(f64, Flat)> {
-        let room = self.flats.iter().map(|f| (self.margin_mm - f.beyond(x.raw()), *f));
-        room.min_by(|a, b| a.0.total_cmp(&b.0))
+    /// The plane that is nearest to being left.
+    fn nearest(&self, x: P3) -> Option<Room> {
+        let bounds = self.field.bounds();
+        let x = x.raw();
+        let out = x - x.clamp(bounds.min.raw(), bounds.max.raw());
+        let room = self.flats.iter().map(|f| match f.beyond(x) {
+            past if past > 0.0 => {
+                Room { mm: self.margin_mm - past - out.length(), gradient: -f.normal - out.normalize_or_zero() }
+            }
+            past => Room { mm: self.margin_mm - past, gradient: -f.normal },
+        });
+        room.min_by(|a, b| a.mm.total_cmp(&b.mm))
     }
 }
 
@@ -181,22 +200,22 @@ impl implicit::Field for Bounded<'_> {
     fn value(&self, x: P3) -> f64 {
         match self.nearest(x) {
             // Outside the margin the sign is known: f is not needed, nor trusted.
-            Some((room, _)) if room <= 0.0 => room,
-            Some((room, _)) => room.min(self.field.value(x)),
+            Some(room) if room.mm <= 0.0 => room.mm,
+            Some(room) => room.mm.min(self.field.value(x)),
             None => self.field.value(x),
         }
     }
     fn gradient(&self, x: P3) -> (f64, space::V3) {
         let (f, g) = self.field.gradient(x);
         match self.nearest(x) {
-            Some((room, plane)) if room < f => (room, -space::V3::from_raw(plane.normal)),
+            Some(room) if room.mm < f => (room.mm, space::V3::from_raw(room.gradient)),
             _ => (f, g),
         }
     }
     fn hessian(&self, x: P3) -> (f64, space::V3, space::DMat3) {
         let (f, g, h) = self.field.hessian(x);
         match self.nearest(x) {
-            Some((room, plane)) if room < f => (room, -space::V3::from_raw(plane.normal), space::DMat3::ZERO),
+            Some(room) if room.mm < f => (room.mm, space::V3::from_raw(room.gradient), space::DMat3::ZERO),
             _ => (f, g, h),
         }
     }
@@ -204,8 +223,8 @@ impl implicit::Field for Bounded<'_> {
         self.field.values(xs, out);
         for (o, &x) in out.iter_mut().zip(xs) {
             match self.nearest(x) {
-                Some((room, _)) if room <= 0.0 => *o = room,
-                Some((room, _)) => *o = o.min(room),
+                Some(room) if room.mm <= 0.0 => *o = room.mm,
+                Some(room) => *o = o.min(room.mm),
                 None => {}
             }
         }

@@ -148,6 +148,25 @@ fn a_graft_at_45_degrees_meets_its_host_where_the_axes_cross() {
     assert_axes(&star, &graph, 1.3 * 7.25, 0.05 * report.spacing_mm);
 }
 
+/// Halfway along it the distal vessel is still as wide as the junction, which once made it a trunk that divides.
+#[test]
+fn a_vessel_cut_off_close_to_its_graft_is_no_trunk() {
+    let centre = P3::new(0.2, -0.1, 0.3);
+    for length in [11.0, 12.0, 13.0] {
+        let branches = [
+            (V3::Z, 48.0, 3.66),
+            (V3::new(0.006, 0.362, -0.932), length, 3.66),
+            (V3::new(0.403, 0.621, 0.673), 70.0, 3.55),
+        ];
+        let star = star(centre, &branches);
+        let (graph, _) = of(&star, &Settings::default());
+        assert_eq!(counts(&graph), (3, 1, 0, 1));
+        let junction = graph.nodes.iter().find(|n| n.kind == NodeKind::Junction).unwrap();
+        let off = junction.position.distance(centre);
+        assert!(off < 0.3, "{length} mm: the junction is {off} mm off");
+    }
+}
+
 #[test]
 fn four_branches_from_one_point_meet_in_one_junction() {
     let star = star(
