@@ -425,9 +425,9 @@ fn joined(line: &Line, ends: [P3; 2], lumen: &Lumen<'_>) -> Line {
     };
     let mut good: Vec<usize> = (1..n - 1).filter(|&i| line.sections[i].is_some()).collect();
     if !line.closed {
-        drop_behind(&mut good, line, ends[0]);
+        drop_behind(&mut good, line, ends);
         good.reverse();
-        drop_behind(&mut good, line, ends[1]);
+        drop_behind(&mut good, line, [ends[1], ends[0]]);
         good.reverse();
     }
     for i in good {
@@ -439,11 +439,13 @@ fn joined(line: &Line, ends: [P3; 2], lumen: &Lumen<'_>) -> Line {
     out
 }
 
-/// Drop the first good centres that lie behind `end`, where the node moved past them.
-fn drop_behind(good: &mut Vec<usize>, line: &Line, end: P3) {
-    let centre = |i: usize| line.sections[i].as_ref().map_or(line.points[i], |s| s.centre);
-    let ahead = |w: &[usize]| (centre(w[1]) - centre(w[0])).dot(centre(w[0]) - end) > 0.0;
-    let behind = good.windows(2).position(ahead).unwrap_or(0);
+/// Drop the first good centres that lie behind the line's first end, where the node moved past them; all of them where it
+/// moved past the whole line, as that of a vessel cut off within its junction does.
+fn drop_behind(good: &mut Vec<usize>, line: &Line, [end, far]: [P3; 2]) {
+    let centre = |i: &usize| line.sections[*i].as_ref().map_or(line.points[*i], |s| s.centre);
+    let way: Vec<P3> = good.iter().map(centre).chain([far]).collect();
+    let ahead = |w: &[P3]| (w[1] - w[0]).dot(w[0] - end) > 0.0;
+    let behind = way.windows(2).position(ahead).unwrap_or(good.len());
     good.drain(..behind);
 }
 
