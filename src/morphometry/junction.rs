@@ -341,7 +341,9 @@ impl<'a> Meeting<'a> {
                 Ruler::Own { to } => (2.0 * radius, 0.0, to),
                 Ruler::Shared { diameter, from, to } => (diameter, from, to),
             };
-            let from = (FROM_CROTCH * overlap).max(user_from * diameter);
+            // sections swollen by the junction may reach beyond what the angles say of the lumens' overlap
+            let clear = samples.iter().find(|s| s.usable).map_or(0.0, |s| s.distance - s.half);
+            let from = (FROM_CROTCH * overlap).max(user_from * diameter).max(clear);
             let wanted = user_to * diameter;
             let to = wanted.max(from + WINDOW_WANTED * diameter);
             moved |= to > wanted;

@@ -14,6 +14,9 @@ const SEEDS: u64 = 3;
 /// Random vessels and scans, none of which may come out wrong without a word (the whole survey takes 1,000).
 const DRAWN: u64 = 25;
 
+/// The same with stacks that end anywhere.
+const CUT: u64 = 8;
+
 /// Random vessels whose surfaces another program judges (the whole survey takes 200).
 const SURFACES: u64 = 20;
 
@@ -32,13 +35,14 @@ pub(crate) fn all() -> Result<()> {
     let judged = judged()?;
     let mut checks: Vec<Check<'_>> = vec![
         // the longest first, in halves so that none is left alone at the end
-        Box::new(|| drawn::run(&judged.binary, 1, DRAWN / 2)),
+        Box::new(|| drawn::run(&judged.binary, 1, DRAWN / 2, false)),
         Box::new(|| storm::short(&tools::built_example("storm")?)),
         Box::new(|| survey::run(&judged.binary, 1, SEEDS)),
     ];
     checks.extend(browsers(&judged)?);
     checks.extend(tests);
-    checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2, false)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, 1, CUT, true)));
     checks.extend(judges(&judged)?);
     beside(checks)?;
     fs::remove_dir_all(&judged.work)?;

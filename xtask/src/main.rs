@@ -43,6 +43,9 @@ enum Command {
         /// Number of random vessels of whose surfaces other programs judge, without scans.
         #[arg(long, conflicts_with = "count")]
         surfaces: Option<u64>,
+        /// Let the stacks of the random vessels end anywhere.
+        #[arg(long, requires = "count")]
+        cut: bool,
         /// First seed.
         #[arg(long, default_value_t = 1)]
         first: u64,
@@ -98,7 +101,9 @@ fn run(command: Command) -> Result<()> {
         Command::Test => check::all(),
         Command::Survey { surfaces: Some(count), first, .. } => surfaces::run(count, first.saturating_sub(1)),
         Command::Survey { count: None, first, .. } => survey::run(&tools::release_binary()?, first, 10),
-        Command::Survey { count: Some(count), first, .. } => drawn::run(&tools::release_binary()?, first, count),
+        Command::Survey { count: Some(count), first, cut, .. } => {
+            drawn::run(&tools::release_binary()?, first, count, cut)
+        }
         Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),
         Command::Bench { what: bench::What::Fit, repeat, .. } => bench::fit(repeat),
