@@ -223,5 +223,13 @@ fn graph_faults(result: &Value) -> Vec<String> {
         let [w, e, c] = ["watertight", "euler", "components"].map(|k| surface[k].to_string());
         faults.push(format!("watertight {w}, Euler number {e}, {c} pieces"));
     }
+    let moved = ["min", "max"].map(|end| surface["displacement_px"][end].as_f64().map_or(f64::INFINITY, f64::abs));
+    if moved[0].max(moved[1]) > 1.0 {
+        faults.push(format!("smoothing moved the wall by {moved:?} px"));
+    }
+    let least = surface["min_angle_deg"].as_f64().unwrap_or(0.0);
+    if least < 30.0 {
+        faults.push(format!("smallest triangle angle {least:.1} degrees"));
+    }
     faults
 }
