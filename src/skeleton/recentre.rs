@@ -501,6 +501,33 @@ mod tests {
     }
 
     #[test]
+    fn what_a_junction_swells_ends_where_the_sections_rest_and_a_taper_is_none() {
+        let way: Vec<f64> = (0..40).map(|k| 0.5 * f64::from(k)).collect();
+        let disc = |r: f64| Some(std::f64::consts::PI * r * r);
+        let stepped: Vec<_> = way.iter().map(|&s| disc(if s < 7.0 { 5.0 } else { 3.6 })).collect();
+        assert_eq!(swelling(&stepped, &way, 3.6, false), Some(13));
+        let taper: Vec<_> = way.iter().map(|&s| disc(3.6 - s / 30.0)).collect();
+        assert_eq!(swelling(&taper, &way, 3.6, false), None);
+        // with nothing farther out there is nothing to compare with
+        assert_eq!(swelling(&stepped[..15], &way[..15], 3.6, false), None);
+    }
+
+    #[test]
+    fn centres_behind_a_node_that_moved_are_dropped_and_all_of_them_behind_its_end() {
+        let at = |z: f64| P3::new(0.0, 0.0, z);
+        let points: Vec<P3> = (0..8).map(|k| at(7.0 - f64::from(k))).collect();
+        let line = Line { sections: vec![None; points.len()], points, radius: 1.0, closed: false };
+        let left = |end: f64| {
+            let mut good: Vec<usize> = (1..7).collect();
+            drop_behind(&mut good, &line, [at(end), at(0.0)]);
+            good
+        };
+        assert_eq!(left(8.0), [1, 2, 3, 4, 5, 6]);
+        assert_eq!(left(3.5), [4, 5, 6]);
+        assert!(left(0.5).is_empty());
+    }
+
+    #[test]
     fn resampling_keeps_the_ends_and_the_length_of_a_straight_line() {
         let points = [0.0, 0.1, 0.35, 2.0, 2.05, 5.0].map(|x| P3::new(x, 2.0 * x, 0.0));
         let out = resampled(&points, 0.5);

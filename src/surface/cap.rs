@@ -233,3 +233,28 @@ impl implicit::Field for Bounded<'_> {
         self.field.bounds()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields::Analytic;
+    use implicit::Field as _;
+    use space::{Aabb, V3};
+
+    #[test]
+    fn past_a_plane_the_box_of_the_data_ends_the_field_too() {
+        let bounds = Aabb { min: P3::ORIGIN, max: P3::new(10.0, 10.0, 10.0) };
+        let everywhere = Analytic { f: Box::new(|_| (1.0, V3::Z)), bounds };
+        let end = [imaging::CutPlane::new(P3::new(5.0, 5.0, 10.0), V3::Z)];
+        let bounded = Bounded::new(&everywhere, &end, 2.0);
+        let of = |x: f64, z: f64| bounded.value(P3::new(x, 5.0, z));
+        assert_eq!([of(5.0, 9.0), of(5.0, 10.5), of(5.0, 12.5)], [1.0, 1.0, -0.5]);
+        // beside the box: as it is on the inner side, closed on the outer
+        assert_eq!([of(-1.5, 9.0), of(-1.5, 11.0)], [1.0, -0.5]);
+        let (f, gradient) = bounded.gradient(P3::new(-1.5, 5.0, 11.0));
+        assert_eq!((f, gradient.to_array()), (-0.5, [1.0, 0.0, -1.0]));
+        let mut all = [0.0; 2];
+        bounded.values(&[P3::new(-1.5, 5.0, 9.0), P3::new(-1.5, 5.0, 11.0)], &mut all);
+        assert_eq!(all, [1.0, -0.5]);
+    }
+}

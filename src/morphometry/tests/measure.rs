@@ -164,6 +164,36 @@ fn the_five_angles_are_met_to_a_twentieth_of_a_degree() {
     }
 }
 
+/// The junction swells the distal vessel's first 6 mm (graft at 48 degrees, host bent by 21): what is left tells the truth
+/// or nothing.
+#[test]
+fn a_branch_cut_off_close_to_its_junction_is_right_or_null() {
+    let cut_at = |length: f64| {
+        let branches = [
+            (DVec3::new(0.403, 0.621, 0.673), 60.0, 3.55),
+            (DVec3::Z, 48.0, 3.66),
+            (DVec3::new(0.006, 0.362, -0.932), length, 3.66),
+        ];
+        let case = star(DVec3::ZERO, &branches, 0.0);
+        let at = |e: usize, k: usize| Some(case.graph.edges[e].points[k]);
+        let roles = Roles { graft: at(0, 70), proximal: at(1, 70), distal: at(2, 12), flow_from: None };
+        run(&case, roles).unwrap()
+    };
+    let whole = cut_at(45.0);
+    for (length, angles, diameter) in [(13.0, true, true), (7.0, false, true), (4.5, false, false)] {
+        let m = cut_at(length);
+        for name in ["graft_proximal", "graft_distal_planar", "distal_normal"] {
+            let want = angle(&whole.junctions[0], name).unwrap();
+            let got = angle(&m.junctions[0], name);
+            assert!(got.is_none_or(|got| (got - want).abs() < 0.1), "{length} mm: {name} {got:?} for {want}");
+            assert_eq!(got.is_some(), angles || name == "graft_proximal", "{length} mm: {name} {:?}", m.warnings);
+        }
+        let got = m.branches[2].diameter_mm;
+        assert!(got.is_none_or(|d| (d - 7.32).abs() < 0.02 * 7.32), "{length} mm: {got:?}");
+        assert_eq!((got.is_some(), codes(&m).contains(&"sections.short")), (diameter, !diameter), "{length} mm");
+    }
+}
+
 #[test]
 fn areas_perimeters_and_radii_of_round_tubes() {
     let case = anastomosis(45.0, 15.0, [2.5, 3.0, 2.0], 0.05);
