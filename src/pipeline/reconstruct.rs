@@ -368,10 +368,20 @@ fn measured(shell: Shell, field: Sampled, hausdorff_mm: f64, plan: &Plan, ctx: &
     let quality = surface::quality(&mesh, &field, ctx)?;
     let ids: Vec<u32> = (0..caps.len() as u32).collect();
     let patches = surface::patches(&mesh, &ids, ctx)?;
-    let (extended, warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
+    let (extended, mut warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
+    warnings.extend(missed_tolerance(&quality, plan));
     let beside = beside(&mesh, &caps);
     let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
     Ok(Wall { mesh, caps, beside, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
+}
+
+/// Where triangles stand farther off the wall than the plan allows: its shortest edge forbids shorter ones there.
+fn missed_tolerance(quality: &Quality, plan: &Plan) -> Option<Warning> {
+    let (off, wanted, shortest) = (quality.face_max_mm, plan.surface.max_error_mm, plan.surface.edge_mm[0]);
+    let message = format!(
+        "a triangle stands {off:.4} mm off the wall where surface.max_error_mm is {wanted} mm: its edges cannot be shorter; lower the shortest surface.edge_mm of {shortest} mm, or raise the tolerance"
+    );
+    (off > wanted).then(|| Warning { code: "surface.tolerance", message, place: Place::at(quality.farthest_at) })
 }
 
 /// Flow extensions at every cap. They are for solvers: where one has no room the numbers of the scan still stand, so

@@ -188,7 +188,8 @@ impl<'a> Bounded<'a> {
         let out = x - x.clamp(bounds.min.raw(), bounds.max.raw());
         let room = self.flats.iter().map(|f| match f.beyond(x) {
             past if past > 0.0 => {
-                Room { mm: self.margin_mm - past - out.length(), gradient: -f.normal - out.normalize_or_zero() }
+                let aside = out - f.normal * out.dot(f.normal);
+                Room { mm: self.margin_mm - past - aside.length(), gradient: -f.normal - aside.normalize_or_zero() }
             }
             past => Room { mm: self.margin_mm - past, gradient: -f.normal },
         });
