@@ -118,8 +118,10 @@ fn reconstruct(
     })?;
 
     let told = source.warnings.into_iter();
-    let warnings: Vec<Warning> =
-        told.chain(wall.warnings.clone()).chain(medial.warnings).chain(patched.warnings.clone()).collect();
+    let warnings: Vec<Warning> = (told.chain(wall.warnings.clone()).chain(medial.warnings))
+        .chain(patched.warnings.clone())
+        .chain(between_slices(&morphometry, &contours))
+        .collect();
     let digest = source.input.digest.clone();
     let mut files = steps.step("write", |_| {
         let reconstruction = Reconstruction {
@@ -438,6 +440,31 @@ fn medial_lines(
         .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
         .collect();
     skeleton::medial_graph(sampled, &contours.cuts, &caps, seeds, &skeleton::Settings::default(), ctx)
+}
+
+/// A vessel more than so many degrees from the normal of the contours' planes ...
+const ALONG_PLANES_DEG: f64 = 60.0;
+/// ... and narrower than so many of their distances is seen by too few of them: grafts of 4.2 to 4.9 mm at 78 to 81 degrees to slices
+/// 2.8 mm apart have areas 5 to 7.5 % too large, beyond their bands.
+const PLANES_ACROSS: f64 = 2.0;
+
+/// Branches that run within the slices and are hardly wider than the slices are apart.
+fn between_slices(morphometry: &Morphometry, contours: &Contours) -> Vec<Warning> {
+    let [Some(first), Some(last)] = [contours.planes.first(), contours.planes.last()] else { return Vec::new() };
+    let normal = first.normal();
+    let apart = (last.origin - first.origin).dot(normal).abs() / (contours.planes.len().max(2) - 1) as f64;
+    let thin = |b: &morphometry::Branch| {
+        let mut along: Vec<f64> = b.sections.iter().map(|s| s.tangent.dot(normal).abs()).collect();
+        along.sort_by(f64::total_cmp);
+        let angle_deg = along.get(along.len() / 2)?.min(1.0).acos().to_degrees();
+        let diameter = b.diameter_mm.filter(|d| angle_deg > ALONG_PLANES_DEG && *d < PLANES_ACROSS * apart)?;
+        let message = format!(
+            "branch {} runs at {angle_deg:.0} degrees to the slices' normal and is {diameter:.1} mm wide, where slices are {apart:.1} mm apart: too few of them cross it, its areas may be 8 % too large and its angles some degrees off; take thinner slices or slices across it",
+            b.id
+        );
+        Some(Warning { code: "sections.between_slices", message, place: Place::element(b.id) })
+    };
+    morphometry.branches.iter().filter_map(thin).collect()
 }
 
 fn surface_data<'a>(
