@@ -509,7 +509,7 @@ mod tests {
         let taper: Vec<_> = way.iter().map(|&s| disc(3.6 - s / 30.0)).collect();
         assert_eq!(swelling(&taper, &way, 3.6, false), None);
         // with nothing farther out there is nothing to compare with
-        assert_eq!(swelling(&stepped[..15], &way[..15], 3.6, false), None);
+        assert_eq!(swelling(&stepped[..14], &way[..14], 3.6, false), None);
     }
 
     #[test]

@@ -14,6 +14,9 @@ const SEEDS: u64 = 3;
 /// Random vessels and scans, none of which may come out wrong without a word (the whole survey takes 1,000).
 const DRAWN: u64 = 25;
 
+/// A random scan whose graft runs within thick slices: its angles are wrong, and it must say so.
+const BETWEEN_SLICES: u64 = 65;
+
 /// The same with stacks that end anywhere.
 const CUT: u64 = 8;
 
@@ -42,6 +45,7 @@ pub(crate) fn all() -> Result<()> {
     checks.extend(browsers(&judged)?);
     checks.extend(tests);
     checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2, false)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, BETWEEN_SLICES, 1, false)));
     checks.push(Box::new(|| drawn::run(&judged.binary, 1, CUT, true)));
     checks.extend(judges(&judged)?);
     beside(checks)?;
