@@ -533,7 +533,7 @@ fn warn_sections(tracks: &[Track], warnings: &mut Vec<Warning>) {
         }
         if t.diameter().is_none() {
             let message = format!(
-                "branch {} has {:.1} mm of sections clear of junctions, openings and blind ends, less than its radius: it has no diameter",
+                "branch {} has {:.1} mm of sections clear of junctions, openings and blind ends, less than one and a half radii: it has no diameter",
                 t.id,
                 t.span()
             );

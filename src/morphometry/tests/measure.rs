@@ -180,7 +180,7 @@ fn a_branch_cut_off_close_to_its_junction_is_right_or_null() {
         run(&case, roles).unwrap()
     };
     let whole = cut_at(45.0);
-    for (length, angles, diameter) in [(13.0, true, true), (7.0, false, true), (4.5, false, false)] {
+    for (length, angles, diameter) in [(13.0, true, true), (9.0, false, true), (7.0, false, false)] {
         let m = cut_at(length);
         for name in ["graft_proximal", "graft_distal_planar", "distal_normal"] {
             let want = angle(&whole.junctions[0], name).unwrap();
