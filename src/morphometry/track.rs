@@ -209,14 +209,9 @@ impl Track {
         if !self.joint[end] {
             return;
         }
-        let n = self.sections.len();
-        let index = |i: usize| if end == 0 { i } else { n - 1 - i };
-        let way = |i: usize| self.sections[index(i)].abscissa_mm;
-        let from_end: Vec<f64> = (0..n).map(|i| (way(i) - way(0)).abs()).collect();
-        let areas: Vec<Option<f64>> = (0..n).map(|i| self.sections[index(i)].area_mm2).collect();
-        if let Some(last) = skeleton::swelling(&areas, &from_end, self.own_radius(), false) {
-            (0..=last).for_each(|i| self.leak[index(i)] = true);
-        }
+        let areas: Vec<Option<f64>> = self.sections.iter().map(|s| s.area_mm2).collect();
+        let found = skeleton::swollen(&areas, &self.abscissas(), end, self.own_radius(), skeleton::Missing::Unknown);
+        self.leak[found].fill(true);
     }
 
     /// Abscissas along the smoothed centred line.

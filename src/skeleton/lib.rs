@@ -27,7 +27,7 @@ pub use graph::graph;
 pub use lumen::Lumen;
 pub use medial::{Edge, MedialGraph, Node, NodeKind};
 pub use prune::{PruneReport, prune};
-pub use recentre::{recentre, swelling};
+pub use recentre::{Missing, recentre, swollen};
 pub use settings::Settings;
 pub use thin::{ThinReport, thin};
 pub use voxelise::voxelise;

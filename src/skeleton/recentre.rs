@@ -14,6 +14,7 @@ use crate::medial::abscissae;
 use crate::{Error, Lumen, MedialGraph, NodeKind, Settings};
 use exec::Ctx;
 use space::{DMat3, DVec3, P3, V3};
+use std::ops::Range;
 
 /// Half the window over which a tangent is taken, in inscribed radii: shorter windows turn noise of the first pass into
 /// tilted sections, longer ones cut the corners of bends of three radii.
@@ -201,33 +202,50 @@ fn take_sections(
 
 /// Drop the sections of the line's first (end 0) or last part that lie within a junction of inscribed radius `radius`.
 fn drop_swelling(sections: &mut [Option<Section>], s: &[f64], end: usize, radius: f64) {
-    let n = sections.len();
-    let index = |i: usize| if end == 0 { i } else { n - 1 - i };
-    let from_end: Vec<f64> = (0..n).map(|i| if end == 0 { s[i] } else { s[n - 1] - s[n - 1 - i] }).collect();
-    let areas: Vec<Option<f64>> = (0..n).map(|i| sections[index(i)].as_ref().map(|x| x.area)).collect();
-    if let Some(last) = swelling(&areas, &from_end, radius, true) {
-        (0..=last).for_each(|i| sections[index(i)] = None);
+    let areas: Vec<Option<f64>> = sections.iter().map(|x| x.as_ref().map(|x| x.area)).collect();
+    sections[swollen(&areas, s, end, radius, Missing::Swollen)].fill(None);
+}
+
+/// What a section without area says of a junction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Missing {
+    /// It leaks into the junction, unless it lies behind all others.
+    Swollen,
+    /// Nothing.
+    Unknown,
+}
+
+/// The sections of a line, `areas` at abscissae `s`, mm, that a junction of inscribed radius `radius` swells at its first (end
+/// 0) or last point: up to the outermost that is larger by [`SWELLING`] than the median of those one to three radii farther
+/// out.
+pub fn swollen(areas: &[Option<f64>], s: &[f64], end: usize, radius: f64, missing: Missing) -> Range<usize> {
+    let n = areas.len();
+    let from = |i: usize| if end == 0 { i } else { n - 1 - i };
+    let outward: Vec<Option<f64>> = (0..n).map(|i| areas[from(i)]).collect();
+    let way: Vec<f64> = (0..n).map(|i| (s[from(i)] - s[from(0)]).abs()).collect();
+    match (last_swollen(&outward, &way, radius, missing), end) {
+        (None, _) => 0..0,
+        (Some(last), 0) => 0..last + 1,
+        (Some(last), _) => n - 1 - last..n,
     }
 }
 
-/// The last section, counted from a junction of inscribed radius `radius` outward, that is swollen by it: larger than the
-/// median of those one to three radii farther out by [`SWELLING`]. `areas` and the distances `from_end`, mm, are in that
-/// order; where `missing` is set a section without area counts as swollen, unless it lies behind all others.
-pub fn swelling(areas: &[Option<f64>], from_end: &[f64], radius: f64, missing: bool) -> Option<usize> {
+/// [`swollen`] from the junction outward.
+fn last_swollen(areas: &[Option<f64>], way: &[f64], radius: f64, missing: Missing) -> Option<usize> {
     let mut last = None;
     // sections that are missing behind all others are open at a cap, not leaking at the junction
     let outermost = areas.iter().rposition(Option::is_some)?;
-    for i in (0..outermost).take_while(|&i| from_end[i] < SWELLING_RADII * radius) {
-        if from_end[i] > CALM_RADII * radius + last.map_or(0.0, |l: usize| from_end[l]) {
+    for i in (0..outermost).take_while(|&i| way[i] < SWELLING_RADII * radius) {
+        if way[i] > CALM_RADII * radius + last.map_or(0.0, |l: usize| way[l]) {
             break;
         }
         let Some(a) = areas[i] else {
-            last = if missing { Some(i) } else { last };
+            last = if missing == Missing::Swollen { Some(i) } else { last };
             continue;
         };
         let r = (a / std::f64::consts::PI).sqrt();
         let mut outward: Vec<f64> = (i + 1..areas.len())
-            .filter(|&j| from_end[j] > from_end[i] + r && from_end[j] <= from_end[i] + 3.0 * r)
+            .filter(|&j| way[j] > way[i] + r && way[j] <= way[i] + 3.0 * r)
             .filter_map(|j| areas[j])
             .collect();
         outward.sort_by(f64::total_cmp);
@@ -505,11 +523,14 @@ mod tests {
         let way: Vec<f64> = (0..40).map(|k| 0.5 * f64::from(k)).collect();
         let disc = |r: f64| Some(std::f64::consts::PI * r * r);
         let stepped: Vec<_> = way.iter().map(|&s| disc(if s < 7.0 { 5.0 } else { 3.6 })).collect();
-        assert_eq!(swelling(&stepped, &way, 3.6, false), Some(13));
+        let found = |areas: &[Option<f64>], end| swollen(areas, &way[..areas.len()], end, 3.6, Missing::Unknown);
+        assert_eq!(found(&stepped, 0), 0..14);
         let taper: Vec<_> = way.iter().map(|&s| disc(3.6 - s / 30.0)).collect();
-        assert_eq!(swelling(&taper, &way, 3.6, false), None);
+        assert_eq!(found(&taper, 0), 0..0);
         // with nothing farther out there is nothing to compare with
-        assert_eq!(swelling(&stepped[..14], &way[..14], 3.6, false), None);
+        assert_eq!(found(&stepped[..14], 0), 0..0);
+        let backwards: Vec<_> = stepped.iter().rev().copied().collect();
+        assert_eq!((found(&backwards, 1), found(&backwards, 0)), (26..40, 0..0));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! `cargo xtask test`: every check, in the order in which a failure costs least.
 
+use crate::drawn::Stacks;
 use crate::{drawn, shell, storm, surfaces, survey, tools};
 use anyhow::{Context as _, Result, bail};
 use std::collections::VecDeque;
@@ -38,15 +39,15 @@ pub(crate) fn all() -> Result<()> {
     let judged = judged()?;
     let mut checks: Vec<Check<'_>> = vec![
         // the longest first, in halves so that none is left alone at the end
-        Box::new(|| drawn::run(&judged.binary, 1, DRAWN / 2, false)),
+        Box::new(|| drawn::run(&judged.binary, 1, DRAWN / 2, Stacks::Whole)),
         Box::new(|| storm::short(&tools::built_example("storm")?)),
         Box::new(|| survey::run(&judged.binary, 1, SEEDS)),
     ];
     checks.extend(browsers(&judged)?);
     checks.extend(tests);
-    checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2, false)));
-    checks.push(Box::new(|| drawn::run(&judged.binary, BETWEEN_SLICES, 1, false)));
-    checks.push(Box::new(|| drawn::run(&judged.binary, 1, CUT, true)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, 1 + DRAWN / 2, DRAWN - DRAWN / 2, Stacks::Whole)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, BETWEEN_SLICES, 1, Stacks::Whole)));
+    checks.push(Box::new(|| drawn::run(&judged.binary, 1, CUT, Stacks::Cut)));
     checks.extend(judges(&judged)?);
     beside(checks)?;
     fs::remove_dir_all(&judged.work)?;

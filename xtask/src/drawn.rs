@@ -30,6 +30,24 @@ struct Bounds {
     area_percent: f64,
 }
 
+/// Where the stacks end.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Stacks {
+    /// Some diameters from the junction.
+    Whole,
+    /// Anywhere.
+    Cut,
+}
+
+impl Stacks {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Whole => "random",
+            Self::Cut => "cut",
+        }
+    }
+}
+
 /// How a scan ended.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum End {
@@ -53,12 +71,12 @@ impl End {
 }
 
 /// Reconstruct `count` random scans; one that is wrong without a warning, or that ends in no stated fault, is an error.
-pub(crate) fn run(binary: &Path, first: u64, count: u64, cut: bool) -> Result<()> {
+pub(crate) fn run(binary: &Path, first: u64, count: u64, stacks: Stacks) -> Result<()> {
     ensure!(count > 0, "a survey of no scan proves nothing");
     let mut ends: BTreeMap<End, u64> = BTreeMap::new();
     let mut bad = Vec::new();
     for seed in first..first + count {
-        let (end, line) = scan(binary, seed, cut).with_context(|| format!("seed {seed}"))?;
+        let (end, line) = scan(binary, seed, stacks).with_context(|| format!("seed {seed}"))?;
         println!("{seed:4} {}  {line}", end.name());
         *ends.entry(end).or_default() += 1;
         if end >= End::Silent {
@@ -75,8 +93,8 @@ pub(crate) fn run(binary: &Path, first: u64, count: u64, cut: bool) -> Result<()
     Ok(())
 }
 
-fn scan(binary: &Path, seed: u64, cut: bool) -> Result<(End, String)> {
-    let work = tools::target()?.join(format!("survey-{}-{seed}", if cut { "cut" } else { "random" }));
+fn scan(binary: &Path, seed: u64, stacks: Stacks) -> Result<(End, String)> {
+    let work = tools::target()?.join(format!("survey-{}-{seed}", stacks.name()));
     if work.exists() {
         fs::remove_dir_all(&work)?;
     }
@@ -86,7 +104,7 @@ fn scan(binary: &Path, seed: u64, cut: bool) -> Result<(End, String)> {
     ensure!(shell::succeeds(phantom), "no scan could be simulated");
     let read = |path: &Path| -> Result<Value> { Ok(serde_json::from_slice(&fs::read(path)?)?) };
     let truth = read(&scan.join("truth.json"))?;
-    if cut {
+    if stacks == Stacks::Cut {
         let plan = shortened(read(&scan.join("plan.json"))?, &truth, seed, fs::read_dir(scan.join("dicom"))?.count())?;
         fs::write(scan.join("plan.json"), serde_json::to_vec_pretty(&plan)?)?;
     }
@@ -94,7 +112,7 @@ fn scan(binary: &Path, seed: u64, cut: bool) -> Result<(End, String)> {
     run.args(["run", "--json"]).arg(scan.join("dicom")).arg("--plan").arg(scan.join("plan.json"));
     let ended = run.arg("--out").arg(&out).output().context("cannot start the reconstruction")?;
     let row = match ended.status.code() {
-        Some(0) if cut => judge_cut(&read(&out.join("result.json"))?, &truth)?,
+        Some(0) if stacks == Stacks::Cut => judge_cut(&read(&out.join("result.json"))?, &truth)?,
         Some(0) => judge(&read(&out.join("result.json"))?, &truth)?,
         Some(2..=4) => (End::Refused, code(&ended.stderr)),
         other => (End::Broken, format!("exit {other:?} {}", String::from_utf8_lossy(&ended.stderr))),

@@ -102,7 +102,8 @@ fn run(command: Command) -> Result<()> {
         Command::Survey { surfaces: Some(count), first, .. } => surfaces::run(count, first.saturating_sub(1)),
         Command::Survey { count: None, first, .. } => survey::run(&tools::release_binary()?, first, 10),
         Command::Survey { count: Some(count), first, cut, .. } => {
-            drawn::run(&tools::release_binary()?, first, count, cut)
+            let stacks = if cut { drawn::Stacks::Cut } else { drawn::Stacks::Whole };
+            drawn::run(&tools::release_binary()?, first, count, stacks)
         }
         Command::Bench { what: bench::What::Whole, repeat, .. } => bench::run(&tools::release_binary()?, repeat),
         Command::Bench { what: bench::What::Thinning, repeat, .. } => bench::thinning(repeat),

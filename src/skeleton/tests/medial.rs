@@ -148,22 +148,25 @@ fn a_graft_at_45_degrees_meets_its_host_where_the_axes_cross() {
     assert_axes(&star, &graph, 1.3 * 7.25, 0.05 * report.spacing_mm);
 }
 
-/// Halfway along it the distal vessel is still as wide as the junction, which once made it a trunk that divides.
+/// Halfway along it the distal vessel is still as wide as the junction: taken for a trunk that divides, it drew the
+/// junction of the second of these rough walls 8 mm into the crotch.
 #[test]
 fn a_vessel_cut_off_close_to_its_graft_is_no_trunk() {
-    let centre = P3::new(0.2, -0.1, 0.3);
-    for length in [11.0, 12.0, 13.0] {
+    const VOXEL_MM: f64 = 0.8;
+    for (x, length) in [(0.33, 9.0), (0.46, 9.5), (0.59, 10.0)] {
+        let centre = P3::new(x, -0.1, 0.3);
         let branches = [
             (V3::Z, 48.0, 3.66),
             (V3::new(0.006, 0.362, -0.932), length, 3.66),
             (V3::new(0.403, 0.621, 0.673), 70.0, 3.55),
         ];
-        let star = star(centre, &branches);
-        let (graph, _) = of(&star, &Settings::default());
+        let mut star = star(centre, &branches);
+        star.vessel.ripple = [0.35 * VOXEL_MM, 3.0 * VOXEL_MM];
+        let (graph, _) = of(&star, &at_spacing(VOXEL_MM));
         assert_eq!(counts(&graph), (3, 1, 0, 1));
         let junction = graph.nodes.iter().find(|n| n.kind == NodeKind::Junction).unwrap();
         let off = junction.position.distance(centre);
-        assert!(off < 0.3, "{length} mm: the junction is {off} mm off");
+        assert!(off < 0.5, "{length} mm: the junction is {off} mm off");
     }
 }
 

@@ -107,17 +107,21 @@ pub fn quads(
     crate::web::Web::weave(mesh)?;
     let planes = cap_planes(mesh, cuts)?;
     let sections: Vec<Flat> = sections.iter().filter_map(Flat::of).collect();
-    let mut first = None;
-    for attempt in 0..ATTEMPTS {
-        match woven((mesh, field), (&planes, &sections), attempt, settings, ctx) {
+    let by = |attempt: usize| woven((mesh, field), (&planes, &sections), attempt, settings, ctx);
+    let marks = match by(0)? {
+        Ok(out) => return Ok(out),
+        Err(marks) => marks,
+    };
+    for attempt in 1..ATTEMPTS {
+        match by(attempt) {
             Ok(Ok(out)) => return Ok(out),
-            Ok(Err(marks)) => first = first.or(Some(unsettled(&marks))),
+            Ok(Err(_)) => {}
             // no other division
-            Err(Error::Patches { .. }) if first.is_some() => break,
+            Err(Error::Patches { .. }) => break,
             Err(e) => return Err(e),
         }
     }
-    Err(first.unwrap_or_else(|| unsettled(&[])))
+    Err(unsettled(&marks))
 }
 
 /// Other divisions are tried where the first one's patches do not settle, one wall in some hundreds.
