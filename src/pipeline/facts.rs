@@ -1,7 +1,7 @@
 //! The stages' reports in the words of the artefacts.
 
-use crate::reconstruct::Wall;
 use crate::step::StageTime;
+use crate::wall::Wall;
 use artefact::read::InputReport;
 use artefact::reconstruction::{
     Candidate, CapFacts, ImplicitFacts, InputFacts, Patches, QualityFacts, Range, SegmentationFacts, SurfaceFacts,

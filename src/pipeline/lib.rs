@@ -11,6 +11,7 @@ mod patches;
 mod reconstruct;
 mod source;
 mod step;
+mod wall;
 
 pub use failure::Failure;
 pub use reconstruct::{Understood, input, run, run_after, understand, validate};

@@ -1,6 +1,6 @@
 //! The wall as quadrilaterals of high order, opened where the medial lines say so.
 
-use crate::reconstruct::Wall;
+use crate::wall::Wall;
 use artefact::reconstruction::Quadrilaterals;
 use exec::Ctx;
 use imaging::{Contours, CutPlane};
