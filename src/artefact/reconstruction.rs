@@ -221,6 +221,10 @@ pub struct CapFacts {
     pub normal: V3,
     /// Area, mm2.
     pub area_mm2: f64,
+    /// Angle between the normal and the medial line that ends there, degrees; none where no line ends.
+    pub oblique_deg: Option<f64>,
+    /// Length of medial line between the end of the data and the cap, mm: 0 where the cap lies in the data's own end.
+    pub set_back_mm: Option<f64>,
 }
 
 /// Patches of the wall with their surface coordinates.

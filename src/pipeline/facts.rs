@@ -1,5 +1,6 @@
 //! The stages' reports in the words of the artefacts.
 
+use crate::openings::{Openings, Planes, crossing};
 use crate::step::StageTime;
 use crate::wall::Wall;
 use artefact::read::InputReport;
@@ -60,7 +61,13 @@ pub(crate) fn implicit(r: &implicit::FitReport) -> ImplicitFacts {
     }
 }
 
-pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphometry: &Morphometry) -> SurfaceFacts {
+pub(crate) fn surface(
+    wall: &Wall,
+    ends: (&Planes, &Openings),
+    pixel_mm: f64,
+    graph: &MedialGraph,
+    morphometry: &Morphometry,
+) -> SurfaceFacts {
     let d = &wall.displacement;
     SurfaceFacts {
         min_angle_deg: wall.quality.min_angle_deg,
@@ -78,7 +85,7 @@ pub(crate) fn surface(wall: &Wall, pixel_mm: f64, graph: &MedialGraph, morphomet
             hausdorff_mm: wall.hausdorff_mm,
             volume_change: volume_change(wall),
         },
-        caps: caps(wall, graph, morphometry),
+        caps: caps(wall, ends, graph, morphometry),
     }
 }
 
@@ -95,7 +102,7 @@ fn volume_change(wall: &Wall) -> f64 {
 
 /// A cap is named by the role of the branch that ends there; by the branch's number where several caps have that role,
 /// or by its own where no branch ends.
-fn caps(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapFacts> {
+fn caps(wall: &Wall, ends: (&Planes, &Openings), graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapFacts> {
     let branch = |c: &surface::Cap| {
         let face = wall.beside.iter().find(|b| b[0] == c.face_id).map_or(c.face_id, |b| b[1]);
         let node = graph.nodes.iter().position(|n| n.cap == Some(face))?;
@@ -110,7 +117,10 @@ fn caps(wall: &Wall, graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapF
         None => format!("end_{}", wall.caps[i].face_id),
     };
     let boundary = boundaries(&wall.caps, &branches);
+    let crossing: Vec<_> = wall.caps.iter().map(|c| crossing(c, graph, ends)).collect();
     let fact = |(i, c): (usize, &surface::Cap)| CapFacts {
+        oblique_deg: crossing[i].map(|c| c.0),
+        set_back_mm: crossing[i].map(|c| c.1),
         face_id: c.face_id,
         name: name(i),
         boundary: boundary[i].clone(),

@@ -7,6 +7,7 @@ mod failure;
 mod folder;
 mod memory;
 mod mesh_fault;
+mod openings;
 mod patches;
 mod reconstruct;
 mod source;

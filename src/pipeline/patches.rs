@@ -3,7 +3,7 @@
 use crate::wall::Wall;
 use artefact::reconstruction::Quadrilaterals;
 use exec::Ctx;
-use imaging::{Contours, CutPlane};
+use imaging::CutPlane;
 use skeleton::{Edge, MedialGraph, NodeKind};
 use space::{FaultKind, Faulty, P3, V3, Warning};
 use surface::{QuadSettings, Quads};
@@ -35,12 +35,12 @@ impl Patched {
 /// Quadrilaterals of the wall. A wall that has no such division is a warning: the scan's numbers do not depend on it.
 pub(crate) fn patched(
     wall: &Wall,
-    contours: &Contours,
+    cuts: &[CutPlane],
     graph: &MedialGraph,
     ctx: &Ctx,
 ) -> Result<Patched, surface::Error> {
     let Some(field) = &wall.field else { return Ok(Patched::default()) };
-    let made = surface::quads(&wall.mesh, field, &contours.cuts, &sections(graph), &QuadSettings::default(), ctx);
+    let made = surface::quads(&wall.mesh, field, cuts, &sections(graph), &QuadSettings::default(), ctx);
     match made {
         Ok(quads) => Ok(Patched { asked: true, quads: Some(quads), warnings: Vec::new() }),
         Err(e) if e.kind() == FaultKind::Cancelled => Err(e),

@@ -3,9 +3,10 @@
 use crate::ends;
 use crate::memory::Memory;
 use crate::mesh_fault::MeshFault;
+use crate::openings::{Openings, Planes, settle};
 use crate::patches::{self, Patched};
 use crate::step::{Steps, peak_memory_bytes};
-use crate::wall::{Seeds, Wall, raw_surface, rimmed, smoothed, within};
+use crate::wall::{Seeds, Wall, openings, raw_surface, rimmed, smoothed, within};
 use crate::{Failure, Observer, folder};
 use crate::{facts, source};
 use artefact::plan::Plan;
@@ -14,11 +15,11 @@ use artefact::write::{self, NamedBytes, Provenance};
 use artefact::{Reconstruction, reconstruction::SurfaceData};
 use exec::Ctx;
 use imaging::{Contours, Stack};
-use implicit::{Draws, Sampled};
+use implicit::{Draws, Sampled, Variational};
 use morphometry::Morphometry;
 use serde_json::{Value, json};
-use skeleton::{CapHint, MedialGraph};
-use space::{FaultKind, P3, Place, Warning};
+use skeleton::MedialGraph;
+use space::{FaultKind, Place, Warning};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -68,35 +69,39 @@ fn reconstruct(
         None => source::scanned(inputs, plan, &mut steps)?,
         Some(variant) => source::changed(inputs, plan, variant, &mut steps)?,
     };
-    let (mut contours, plan) = (source.contours, &source.plan);
+    let (contours, plan) = (source.contours, &source.plan);
     let (f, fit, ensemble) =
         steps.step("fit", |ctx| implicit::fit_with_ensemble(&contours, &fit_settings(), source.draws, ctx))?;
     let raw = steps.step("polygonise", |ctx| raw_surface(&f, &contours, ctx))?;
-    let (sampled, image, ends) = steps.step("smooth", |ctx| {
+    let (sampled, image, mut planes) = steps.step("smooth", |ctx| {
         let (sampled, image) = smoothed(&f, &raw, &contours, plan, &ctx.part(0.0, 0.8))?;
         let seeds = within(&contours, f.inner());
-        let ends = ends::ends(&plan.ends.cut_mm, &sampled, &contours, &seeds, &ctx.part(0.8, 1.0))?;
-        Ok::<_, MeshFault>((sampled, image.kept(&ends), ends))
+        let given = ends::ends(&plan.ends.cut_mm, &sampled, &contours, &seeds, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((sampled, image, Planes::new(&contours.cuts, given)))
     })?;
-    contours.cuts.extend(&ends.cuts);
-    let mut seeds = Seeds::new(&f, &contours, &ends);
-    let wall = steps.step("mesh", |ctx| {
-        let given = ends.cuts.len();
-        rimmed(&f, (&mut seeds, &ends), &image, (&mut contours, given), plan, ctx)
+    let (openings, mut graph, medial) = steps.step("skeleton", |ctx| {
+        let openings = openings((&f, &sampled), &mut planes, contours.pixel_mm, &ctx.part(0.0, 0.2))?;
+        let (graph, medial) = medial_lines(&f, &sampled, (&planes, &openings), &ctx.part(0.2, 1.0))?;
+        planes.square(&graph, &openings, &sampled, contours.pixel_mm);
+        Ok::<_, MeshFault>((openings, graph, medial))
     })?;
-    let contours = contours;
-    let (graph, medial, patched) = steps.step("skeleton", |ctx| {
-        let (graph, medial) = medial_lines(&sampled, &seeds.inner, &contours, &wall, &ctx.part(0.0, 0.8))?;
-        let patched = patches::patched(&wall, &contours, &graph, &ctx.part(0.8, 1.0))?;
-        Ok::<_, MeshFault>((graph, medial, patched))
+    let of_data = planes.of_data();
+    let (wall, patched, lost) = steps.step("mesh", |ctx| {
+        let wall = rimmed(&f, &image, (&mut planes, &openings), plan, &ctx.part(0.0, 0.8))?;
+        let lost = settle(&mut graph, &wall, (&planes, &openings), &sampled)?;
+        let patched = patches::patched(&wall, &planes.all(), &graph, &ctx.part(0.8, 1.0))?;
+        Ok::<_, MeshFault>((wall, patched, lost))
     })?;
     let morphometry = steps.step("measure", |ctx| {
         let draws: Option<&dyn Draws> = if source.draws > 0 { Some(&ensemble) } else { None };
-        morphometry::measure_with_bands(&graph, &sampled, &contours.cuts, draws, &plan.morphometry(), ctx)
+        morphometry::measure_with_bands(&graph, &sampled, &of_data, draws, &plan.morphometry(), ctx)
     })?;
+    let surface = surface_data(&wall, (&planes, &openings), contours.pixel_mm, &graph, &morphometry, &patched);
 
     let told = source.warnings.into_iter();
-    let warnings: Vec<Warning> = (told.chain(wall.warnings.clone()).chain(medial.warnings))
+    let warnings: Vec<Warning> = (told.chain(planes.warnings()).chain(wall.warnings.clone()))
+        .chain(medial.warnings)
+        .chain(lost)
         .chain(patched.warnings.clone())
         .chain(between_slices(&morphometry, &contours))
         .collect();
@@ -107,7 +112,7 @@ fn reconstruct(
             segmentation: source.segmentation,
             contours: &contours,
             implicit: facts::implicit(&fit),
-            surface: surface_data(&wall, contours.pixel_mm, &graph, &morphometry, &patched),
+            surface,
             graph: &graph,
             morphometry: &morphometry,
             warnings: &warnings,
@@ -173,19 +178,13 @@ fn refuse_unmade(plan: &Plan) -> Result<(), Failure> {
 
 /// Medial lines of the unsmoothed image of f: the numbers come from the data, not from the smoothed wall.
 fn medial_lines(
+    f: &Variational,
     sampled: &Sampled,
-    seeds: &[P3],
-    contours: &Contours,
-    wall: &Wall,
+    (planes, openings): (&Planes, &Openings),
     ctx: &Ctx,
 ) -> Result<(MedialGraph, skeleton::Report), skeleton::Error> {
-    let caps: Vec<CapHint> = wall
-        .caps
-        .iter()
-        .filter(|c| wall.beside.iter().all(|&[small, _]| small != c.face_id))
-        .map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward })
-        .collect();
-    skeleton::medial_graph(sampled, &contours.cuts, &caps, seeds, &skeleton::Settings::default(), ctx)
+    let (cuts, seeds) = (planes.of_data(), Seeds::new(f, planes).inner);
+    skeleton::medial_graph(sampled, &cuts, &openings.hints(), &seeds, &skeleton::Settings::default(), ctx)
 }
 
 /// A vessel more than so many degrees from the normal of the contours' planes ...
@@ -215,6 +214,7 @@ fn between_slices(morphometry: &Morphometry, contours: &Contours) -> Vec<Warning
 
 fn surface_data<'a>(
     wall: &'a Wall,
+    ends: (&Planes, &Openings),
     pixel_mm: f64,
     graph: &MedialGraph,
     morphometry: &Morphometry,
@@ -222,7 +222,7 @@ fn surface_data<'a>(
 ) -> SurfaceData<'a> {
     SurfaceData {
         mesh: &wall.mesh,
-        quality: facts::surface(wall, pixel_mm, graph, morphometry),
+        quality: facts::surface(wall, ends, pixel_mm, graph, morphometry),
         displacement_mm: &wall.displacement.mm,
         displacement_px: &wall.displacement.px,
         patches: Some(facts::patches(&wall.patches)),

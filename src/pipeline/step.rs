@@ -46,8 +46,8 @@ const SHARES: [(&str, f64); 9] = [
     ("fit", 0.28),
     ("polygonise", 0.08),
     ("smooth", 0.12),
-    ("mesh", 0.20),
     ("skeleton", 0.08),
+    ("mesh", 0.20),
     ("measure", 0.07),
     ("write", 0.05),
 ];

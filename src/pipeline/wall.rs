@@ -1,7 +1,7 @@
 //! The wall of the lumen: f as a 3D image, smoothed within the plan's bound, cut where the data end, meshed, measured.
 
-use crate::ends::Ends;
 use crate::mesh_fault::MeshFault;
+use crate::openings::{Openings, Planes, beside};
 use artefact::plan::Plan;
 use exec::Ctx;
 use imaging::Contours;
@@ -68,14 +68,6 @@ pub(crate) struct Image {
     sampled: Sampled,
 }
 
-impl Image {
-    /// Only wall that is kept tells how far it may be smoothed.
-    pub(crate) fn kept(self, ends: &Ends) -> Self {
-        let wall = self.wall.into_iter().filter(|&p| ends.keeps(p)).collect();
-        Self { wall, ..self }
-    }
-}
-
 /// Points from which wall and lumen are grown: those of the fit on what is kept.
 pub(crate) struct Seeds {
     pub(crate) wall: Vec<P3>,
@@ -83,9 +75,11 @@ pub(crate) struct Seeds {
 }
 
 impl Seeds {
-    pub(crate) fn new(f: &Variational, contours: &Contours, ends: &Ends) -> Self {
-        let kept = |points: &[P3]| points.iter().copied().filter(|&p| ends.keeps(p)).collect::<Vec<_>>();
-        Self { wall: kept(f.wall()), inner: kept(&within(contours, f.inner())) }
+    pub(crate) fn new(f: &Variational, planes: &Planes) -> Self {
+        let kept = |points: &[P3]| points.iter().copied().filter(|&p| planes.keeps(p)).collect::<Vec<_>>();
+        let (cuts, mut inner) = (planes.all(), kept(f.inner()));
+        inner.retain(|&p| cuts.iter().all(|c| !c.excludes(p)));
+        Self { wall: kept(f.wall()), inner }
     }
 }
 
@@ -100,77 +94,68 @@ const ATTEMPTS: usize = 6;
 /// Factor on sigma between attempts.
 const RETREAT: f64 = 0.75;
 
-/// How far a plane at which the data end is moved inward at once, and at most, mm.
-const INWARD_MM: [f64; 2] = [1.0, 4.0];
-
-/// The finished wall. Where the data end in a plane that only grazes a vessel there is no rim to speak of: that plane is
-/// moved inward, with a warning; not one of the `given` cuts, which are the last and which the plan asks for.
-pub(crate) fn rimmed(
-    f: &Variational,
-    (seeds, ends): (&mut Seeds, &Ends),
-    image: &Image,
-    (contours, given): (&mut Contours, usize),
-    plan: &Plan,
+/// Where the planes cut the unsmoothed wall; where they only graze it others are taken.
+pub(crate) fn openings(
+    (f, sampled): (&Variational, &Sampled),
+    planes: &mut Planes,
+    pixel_mm: f64,
     ctx: &Ctx,
-) -> Result<Wall, MeshFault> {
-    let first = contours.cuts.len() - given;
-    let mut inward = vec![(0.0, Place::default()); first];
+) -> Result<Openings, surface::Error> {
+    let cell = PolygoniseSettings { cell_mm: pixel_mm, ..PolygoniseSettings::default() };
     loop {
-        let fault = match wall(f, seeds, image, contours, plan, ctx) {
-            Err(MeshFault::Surface(e)) => e,
-            Ok(mut wall) => {
-                let moved = inward.into_iter().filter(|(mm, _)| *mm > 0.0);
-                wall.warnings.extend(moved.map(|(mm, place)| Warning {
-                    code: "ends.inward",
-                    message: format!(
-                        "the data end where a vessel's wall only grazes the plane of their end: all vessels are cut {mm:.0} mm further in there"
-                    ),
-                    place,
-                }));
-                return Ok(wall);
-            }
-            other => return other,
-        };
-        let room = |plane: &usize| inward.get(*plane).is_some_and(|(mm, _)| *mm < INWARD_MM[1]);
-        let Some(plane) = fault.without_rim().filter(room) else { return Err(fault.into()) };
-        inward[plane] = (inward[plane].0 + INWARD_MM[0], fault.place());
-        let cut = &mut contours.cuts[plane];
-        cut.point = cut.point - cut.outward * INWARD_MM[0];
-        *seeds = Seeds::new(f, contours, ends);
+        let seeds = Seeds::new(f, planes);
+        match surface::openings(sampled, &seeds.wall, &planes.of_data(), &cell, ctx) {
+            Ok((mesh, caps)) => return Ok(Openings::new(&mesh, caps)),
+            Err(fault) => planes.retreat(&fault).ok_or(fault)?,
+        }
     }
 }
 
-/// The wall: smoothed, cut at the data's ends, capped, remeshed, measured.
-fn wall(
+/// The finished wall; where a plane leaves it without a rim others are taken.
+pub(crate) fn rimmed(
     f: &Variational,
-    seeds: &Seeds,
     image: &Image,
-    contours: &Contours,
+    (planes, openings): (&mut Planes, &Openings),
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<Wall, MeshFault> {
+    loop {
+        match wall(f, image, (planes, openings), plan, ctx) {
+            Err(MeshFault::Surface(fault)) => planes.retreat(&fault).ok_or(fault)?,
+            other => return other,
+        }
+    }
+}
+
+/// The wall: smoothed, cut by the planes, capped, remeshed, measured.
+fn wall(f: &Variational, image: &Image, ends: (&Planes, &Openings), plan: &Plan, ctx: &Ctx) -> Result<Wall, MeshFault> {
+    let seeds = Seeds::new(f, ends.0);
+    let pixel_mm = image.smoothing.pixel_mm;
+    // only wall that is kept tells how far it may be smoothed
+    let kept: Vec<P3> = image.wall.iter().copied().filter(|&p| ends.0.keeps(p)).collect();
+    let shell_of = |field: &Sampled, ctx: &Ctx| shell_of(field, (f, &seeds, pixel_mm), ends, plan, ctx);
     let mut limit = if image.smoothing.max_displacement_px > 0.0 { f64::INFINITY } else { 0.0 };
     for _ in 0..ATTEMPTS {
         let (field, report) = if limit > 0.0 {
-            implicit::smooth(&image.sampled, &image.wall, &image.smoothing, limit, &ctx.part(0.0, 0.3))?
+            implicit::smooth(&image.sampled, &kept, &image.smoothing, limit, &ctx.part(0.0, 0.3))?
         } else {
             break;
         };
         limit = report.sigma_mm * RETREAT;
-        let shell = match shell_of(&field, (f, seeds), contours, plan, &ctx.part(0.3, 0.9)) {
+        let shell = match shell_of(&field, &ctx.part(0.3, 0.9)) {
             // two lumens that all but touch: another smoothing parts or joins them
             Err(e) if e.is_unresolved() => continue,
             shell => shell?,
         };
         let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
-        if moved <= image.smoothing.max_displacement_px * contours.pixel_mm {
-            let back = TriMesh { vertices: image.wall.clone(), ..TriMesh::default() };
-            let back = surface::displacement(&back, &field, contours.pixel_mm, ctx)?;
+        if moved <= image.smoothing.max_displacement_px * pixel_mm {
+            let back = TriMesh { vertices: kept, ..TriMesh::default() };
+            let back = surface::displacement(&back, &field, pixel_mm, ctx)?;
             let moved = moved.max(back.max_mm.max(-back.min_mm));
             return Ok(measured(shell, field, moved, plan, &ctx.part(0.9, 1.0))?);
         }
     }
-    let shell = shell_of(&image.sampled, (f, seeds), contours, plan, &ctx.part(0.0, 0.9))?;
+    let shell = shell_of(&image.sampled, &ctx.part(0.0, 0.9))?;
     let moved = shell.displacement.min_mm.abs().max(shell.displacement.max_mm.abs());
     Ok(measured(shell, image.sampled.clone(), moved, plan, &ctx.part(0.9, 1.0))?)
 }
@@ -184,21 +169,23 @@ struct Shell {
 
 fn shell_of(
     field: &Sampled,
-    (f, seeds): (&Variational, &Seeds),
-    contours: &Contours,
+    (f, seeds, pixel_mm): (&Variational, &Seeds, f64),
+    (planes, openings): (&Planes, &Openings),
     plan: &Plan,
     ctx: &Ctx,
 ) -> Result<Shell, surface::Error> {
-    let cell = PolygoniseSettings { cell_mm: contours.pixel_mm, ..PolygoniseSettings::default() };
+    let cell = PolygoniseSettings { cell_mm: pixel_mm, ..PolygoniseSettings::default() };
     let settings = RemeshSettings {
         edge_mm: plan.surface.edge_mm,
         max_error_mm: plan.surface.max_error_mm,
         sizing: Sizing::Curvature,
         ..RemeshSettings::default()
     };
-    let surface::Shell { mesh, caps, .. } =
-        surface::shell(field, &seeds.wall, &contours.cuts, &cell, &settings, &ctx.part(0.0, 0.8))?;
-    let displacement = surface::displacement(&mesh, f, contours.pixel_mm, &ctx.part(0.8, 1.0))?;
+    let mut shell = surface::shell(field, &seeds.wall, &planes.all(), &cell, &settings, &ctx.part(0.0, 0.8))?;
+    // by where vessels leave the data: how far an end is set back depends on noise
+    shell.number_by(|cap| planes.opening_of(cap, openings).unwrap_or(u32::MAX));
+    let surface::Shell { mesh, caps, .. } = shell;
+    let displacement = surface::displacement(&mesh, f, pixel_mm, &ctx.part(0.8, 1.0))?;
     Ok(Shell { mesh, caps, displacement })
 }
 
@@ -246,19 +233,4 @@ fn extended(
             Ok((None, vec![Warning { code: e.code(), message, place: e.place() }]))
         }
     }
-}
-
-/// Caps that share a rim vertex with a larger one, with the largest such: a vessel that leaves the volume across an edge
-/// of it is cut by two planes, and has one end.
-fn beside(mesh: &TriMesh, caps: &[surface::Cap]) -> Vec<[u32; 2]> {
-    let mut at: Vec<Vec<u32>> = vec![Vec::new(); mesh.vertices.len()];
-    for (t, &id) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id != surface::WALL) {
-        t.iter().for_each(|&v| at[v as usize].push(id));
-    }
-    let area = |id: u32| caps.iter().find(|c| c.face_id == id).map_or(0.0, |c| c.area_mm2);
-    let order = |a: &u32, b: &u32| area(*a).total_cmp(&area(*b)).then(b.cmp(a));
-    let larger = |id: u32| at.iter().filter(|ids| ids.contains(&id)).flatten().copied().max_by(order).unwrap_or(id);
-    // three planes meet in a corner: the largest may be reached over the middle one
-    let largest = |id: u32| (0..3).fold(id, |id, _| larger(id));
-    caps.iter().map(|c| [c.face_id, largest(c.face_id)]).filter(|[id, largest]| id != largest).collect()
 }

@@ -8,6 +8,9 @@ use space::{P3, Place, V3, Warning};
 /// thinning leaves no branch when it ends within a radius of the wall of its parent.
 const STUB_REACH: [f64; 2] = [1.5, 3.0];
 
+/// Shortest last piece of a line that is cut back, mm.
+const LEAST_STEP_MM: f64 = 1e-3;
+
 /// A planar cap of the surface, where a vessel leaves the data.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CapHint {
@@ -38,6 +41,33 @@ pub fn extend_to_caps(graph: &mut MedialGraph, lumen: &Lumen<'_>, caps: &[CapHin
         warnings.extend(attach_stub(graph, cap, *radius, lumen));
     }
     warnings
+}
+
+/// Cut the line that ends at a cap (by [`crate::Node::cap`]) where it passes the cap's plane, when the surface was cut
+/// farther in than the lumen that the lines were drawn in. Nothing happens to a line that does not pass it.
+pub fn cut_back(graph: &mut MedialGraph, cap: &CapHint) {
+    let Some(tip) = graph.nodes.iter().position(|n| n.cap == Some(cap.face_id)) else { return };
+    let Some(edge) = graph.edges.iter_mut().find(|e| e.nodes.contains(&tip)) else { return };
+    let turned = edge.nodes[1] != tip;
+    if turned {
+        edge.reverse();
+    }
+    let height = |p: P3| (p - cap.centroid).dot(cap.normal);
+    let kept = edge.points.iter().rposition(|&p| height(p) < -LEAST_STEP_MM).map_or(0, |i| i + 1);
+    if kept > 0 && kept < edge.points.len() {
+        let [a, b] = [edge.points[kept - 1], edge.points[kept]];
+        let part = height(a) / (height(a) - height(b));
+        let radius = edge.radius_mm[kept - 1] + part * (edge.radius_mm[kept] - edge.radius_mm[kept - 1]);
+        edge.points.truncate(kept);
+        edge.radius_mm.truncate(kept);
+        edge.points.push(a.lerp(b, part));
+        edge.radius_mm.push(radius);
+        let node = &mut graph.nodes[tip];
+        (node.position, node.radius_mm) = (a.lerp(b, part), radius);
+    }
+    if turned {
+        edge.reverse();
+    }
 }
 
 /// Replace the last radius of the branch that ends at `tip` by the straight line to the cap.
@@ -101,4 +131,30 @@ fn split(graph: &mut MedialGraph, e: usize, i: usize, at: usize) {
     edge.radius_mm.push(0.0);
     let last = std::mem::replace(&mut edge.nodes[1], at);
     graph.edges.push(Edge { nodes: [at, last], points, radius_mm });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_cut_back_to_the_plane_from_whichever_end() {
+        let points: Vec<P3> = (0..=10).map(|k| P3::new(f64::from(k), 0.0, 0.0)).collect();
+        let radius_mm: Vec<f64> = (0..=10).map(|k| 2.0 + 0.1 * f64::from(k)).collect();
+        let node = |x: f64, cap| Node { kind: NodeKind::End, position: P3::new(x, 0.0, 0.0), radius_mm: 2.0, cap };
+        let nodes = vec![node(0.0, Some(1)), node(10.0, Some(2))];
+        let mut graph = MedialGraph { nodes, edges: vec![Edge { nodes: [0, 1], points, radius_mm }] };
+        let cap = |face_id, x: f64, normal| CapHint { face_id, centroid: P3::new(x, 0.3, 0.0), normal };
+        cut_back(&mut graph, &cap(1, 2.5, -V3::X));
+        cut_back(&mut graph, &cap(2, 8.0, V3::X));
+        cut_back(&mut graph, &cap(2, 9.0, V3::X));
+        cut_back(&mut graph, &cap(3, 5.0, V3::X));
+        let edge = &graph.edges[0];
+        assert_eq!(edge.nodes, [0, 1]);
+        let ends = [edge.points[0], edge.points[edge.points.len() - 1]];
+        assert!(ends[0].distance(P3::new(2.5, 0.0, 0.0)) < 1e-12 && ends[1].distance(P3::new(8.0, 0.0, 0.0)) < 1e-12);
+        assert_eq!(ends, [graph.nodes[0].position, graph.nodes[1].position]);
+        assert_eq!((edge.points.len(), edge.radius_mm.len()), (7, 7));
+        assert!((graph.nodes[0].radius_mm - 2.25).abs() < 1e-12 && (edge.radius_mm[6] - 2.8).abs() < 1e-12);
+    }
 }

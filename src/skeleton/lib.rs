@@ -20,7 +20,7 @@ mod voxelise;
 mod whole;
 
 pub use bits::BitVolume;
-pub use caps::{CapHint, extend_to_caps};
+pub use caps::{CapHint, cut_back, extend_to_caps};
 pub use check::check;
 pub use error::Error;
 pub use graph::graph;

@@ -248,6 +248,14 @@ impl Error {
             _ => None,
         }
     }
+
+    /// The plane (as given) that cannot be cut by, whatever the reason.
+    pub fn of_plane(&self) -> Option<usize> {
+        match self {
+            Self::CutRunsOn { plane, .. } | Self::NothingLeft { plane, .. } => Some(*plane),
+            _ => self.without_rim(),
+        }
+    }
 }
 
 impl Faulty for Error {

@@ -49,5 +49,5 @@ pub use polygonise::{PolygoniseReport, PolygoniseSettings, polygonise};
 pub use quads::{QuadSettings, Quads, quads};
 pub use quality::{Quality, quality};
 pub use remesh::{RemeshReport, RemeshSettings, Sizing, remesh};
-pub use shell::{Shell, shell};
+pub use shell::{Shell, openings, shell};
 pub use topology::{Defect, DefectKind, Topology, check, topology};

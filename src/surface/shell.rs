@@ -2,7 +2,8 @@
 
 use crate::remesh::{THIN, thinned};
 use crate::{
-    Bounded, Cap, Error, PolygoniseReport, PolygoniseSettings, RemeshReport, RemeshSettings, TriMesh, cut, polygonise,
+    Bounded, Cap, Error, PolygoniseReport, PolygoniseSettings, RemeshReport, RemeshSettings, TriMesh, WALL, cut,
+    polygonise,
 };
 use exec::Ctx;
 use imaging::CutPlane;
@@ -49,19 +50,68 @@ pub fn shell(
     ctx: &Ctx,
 ) -> Result<Shell, Error> {
     let bounded = Bounded::new(field, cuts, MARGIN_CELLS * cell.cell_mm);
-    let by = |halvings: i32| {
-        let cell = PolygoniseSettings { cell_mm: cell.cell_mm * 0.5_f64.powi(halvings), ..cell.clone() };
-        let (raw, polygonised) = polygonise(&bounded, seeds, &cell, &ctx.part(0.0, 0.15))?;
-        let (closed, report) = cut(&raw, field, cuts, &ctx.part(0.15, 0.3))?;
+    let by = |cell: &PolygoniseSettings, halvings: i32| {
+        let (closed, caps, polygonised) = closed((field, &bounded), seeds, cuts, cell, &ctx.part(0.0, 0.3))?;
         let thin = if halvings > 0 { THIN_HALVED } else { THIN };
         let (mesh, remeshed) = thinned(&closed, field, cuts, settings, thin, &ctx.part(0.3, 1.0))?;
-        Ok(Shell { mesh, caps: report.caps, halvings, polygonised, remeshed })
+        Ok(Shell { mesh, caps, halvings, polygonised, remeshed })
     };
-    let mut found = by(0);
+    halving(cell, by)
+}
+
+/// The same wall cut and capped, but not remeshed: enough to see where vessels leave it. Gives the mesh and its caps by
+/// face id.
+///
+/// # Errors
+/// Those of [`polygonise`] and [`cut`].
+pub fn openings(
+    field: &dyn Field,
+    seeds: &[P3],
+    cuts: &[CutPlane],
+    cell: &PolygoniseSettings,
+    ctx: &Ctx,
+) -> Result<(TriMesh, Vec<Cap>), Error> {
+    let bounded = Bounded::new(field, cuts, MARGIN_CELLS * cell.cell_mm);
+    halving(cell, |cell, _| closed((field, &bounded), seeds, cuts, cell, ctx).map(|(mesh, caps, _)| (mesh, caps)))
+}
+
+/// With the cell halved as often as the wall asks for it.
+fn halving<T>(
+    cell: &PolygoniseSettings,
+    by: impl Fn(&PolygoniseSettings, i32) -> Result<T, Error>,
+) -> Result<T, Error> {
+    let mut found = by(cell, 0);
     for halvings in 1..=HALVINGS {
         if found.as_ref().is_err_and(Error::is_unresolved) {
-            found = by(halvings);
+            let half = PolygoniseSettings { cell_mm: cell.cell_mm * 0.5_f64.powi(halvings), ..cell.clone() };
+            found = by(&half, halvings);
         }
     }
     found
+}
+
+/// The mesh on one lattice, cut and capped.
+fn closed(
+    (field, bounded): (&dyn Field, &Bounded<'_>),
+    seeds: &[P3],
+    cuts: &[CutPlane],
+    cell: &PolygoniseSettings,
+    ctx: &Ctx,
+) -> Result<(TriMesh, Vec<Cap>, PolygoniseReport), Error> {
+    let (raw, polygonised) = polygonise(bounded, seeds, cell, &ctx.part(0.0, 0.5))?;
+    let (mesh, report) = cut(&raw, field, cuts, &ctx.part(0.5, 1.0))?;
+    Ok((mesh, report.caps, polygonised))
+}
+
+impl Shell {
+    /// Number the caps by a key of theirs, those with the same one as before.
+    pub fn number_by(&mut self, key: impl Fn(&Cap) -> u32) {
+        self.caps.sort_by_key(|cap| (key(cap), cap.face_id));
+        let mut id_of = vec![WALL; self.caps.len() + 1];
+        for (cap, id) in self.caps.iter_mut().zip(1..) {
+            id_of[cap.face_id as usize] = id;
+            cap.face_id = id;
+        }
+        self.mesh.face_id.iter_mut().for_each(|id| *id = id_of[*id as usize]);
+    }
 }

@@ -77,6 +77,23 @@ def test_names():
             assert np.linalg.norm(again[boundary][2] - at) < 0.5
 
 
+def test_across():
+    """Ends lie across their vessels: in a plane, normal to the true axis, as large as the true section."""
+    truth = {b["role"]: b for b in json.loads((SCAN / "truth.json").read_text())["branches"]}
+    poly = surface(OUT)
+    for cap in result(OUT)["surface"]["caps"]:
+        branch = truth[cap["name"].removeprefix("end_")]
+        lean = np.degrees(np.arccos(np.dot(cap["normal"], branch["direction"])))
+        assert lean < 2, (cap["name"], lean)
+        assert cap["oblique_deg"] < 2 and cap["set_back_mm"] >= 0
+        assert abs(cap["area_mm2"] / branch["area_mm2"] - 1) < 0.02, cap
+        flat = points_of(poly, cap["face_id"])
+        off = (flat - flat.mean(0)) @ np.array(cap["normal"])
+        assert abs(off).max() <= 1e-6, abs(off).max()
+    graft = next(c for c in result(OUT)["surface"]["caps"] if c["name"] == "end_graft")
+    assert 2 < graft["set_back_mm"] < 4.5  # 2.5 tan 45 degrees and the margin
+
+
 def test_cut():
     """The graft ends where the plan wants it; the rest of the vessel is as it was."""
     whole = result(OUT)

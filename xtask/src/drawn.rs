@@ -22,8 +22,15 @@ const COARSE: Bounds = Bounds { angle_deg: 2.4, area_percent: 6.0 };
 
 /// Warnings that say nothing against an angle, an area or a graph: a vessel that leaves the images, an end that carries no flow
 /// extension, a triangle in a sharp wedge. Half the scans have one.
-const NO_CAUSE: [&str; 5] =
-    ["contours.at_border", "surface.oblique_end", "surface.short_end", "surface.defect", "surface.tolerance"];
+const NO_CAUSE: [&str; 7] = [
+    "contours.at_border",
+    "ends.oblique",
+    "ends.set_back",
+    "surface.oblique_end",
+    "surface.short_end",
+    "surface.defect",
+    "surface.tolerance",
+];
 
 struct Bounds {
     angle_deg: f64,

@@ -272,6 +272,8 @@ impl Fixture {
             centroid: CENTRE + V3::from(ARMS[k].0),
             normal: V3::from(ARMS[k].0).normalised().unwrap(),
             area_mm2: 20.0,
+            oblique_deg: Some(0.5),
+            set_back_mm: Some(0.0),
         };
         let range = |s: f64| Range { min: -0.1 * s, max: 0.1 * s, rms: 0.07 * s };
         Reconstruction {

@@ -1,7 +1,7 @@
 //! result.json and skeleton.json: the numbers, under the names and in the order of contract.md.
 //!
 //! Members beyond the contract are additions: `segmentation.axis` and `candidates`; `surface.max_angle_deg`,
-//! `displacement_mm`, `patches`, `quads` (where asked for), `quality` and `caps` (with `boundary`); `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
+//! `displacement_mm`, `patches`, `quads` (where asked for), `quality` and `caps` (with `boundary`, `oblique_deg` and `set_back_mm`); `graph.nodes[].cap`; `branches[].samples.tangent`, `shape` and the standard errors;
 //! `branches[].diameter_band95`, `stenosis`, `helix.curvature_band95` and `enough`; `by_distance.residual_mm`; `junctions[].branches`;
 //! `variant` where the result is a re-synthesis.
 //! What could not be had is null.
@@ -153,6 +153,8 @@ fn cap(c: &CapFacts) -> Json {
         ("centroid", c.centroid.into()),
         ("normal", c.normal.into()),
         ("area_mm2", c.area_mm2.into()),
+        ("oblique_deg", c.oblique_deg.into()),
+        ("set_back_mm", c.set_back_mm.into()),
     ])
 }
 

@@ -9,7 +9,7 @@ import { showResult } from "./result.js";
 import { bytes, duration, t, when } from "./text.js";
 import { Held } from "./transfer.js";
 
-const STAGES = ["read", "contours", "fit", "polygonise", "smooth", "mesh", "skeleton", "measure", "write"];
+const STAGES = ["read", "contours", "fit", "polygonise", "smooth", "skeleton", "mesh", "measure", "write"];
 
 export async function showJob(box, { params, query, signal }) {
   const id = params[0];
