@@ -12,11 +12,16 @@ use crate::worker::Worker;
 use metrics_exporter_prometheus::PrometheusHandle;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
 
 /// The unit of the upload budget, bytes.
 pub const UPLOAD_UNIT: u64 = 1 << 20;
+
+/// How long the answer to a cancel waits for the store.
+const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Shared state; cheap to clone.
 #[derive(Clone, Debug)]
@@ -70,6 +75,19 @@ impl State {
     /// The database's.
     pub async fn audit(&self, who: &Principal, trace: &str, action: &str, object: &str) -> Result<(), Problem> {
         Ok(audit::write(self.queue.db(), entry(who, trace, action, object)).await?)
+    }
+
+    /// Erases what is stored of a cancelled job; whether the store did. The cancel is committed and must be answered: what a store
+    /// leaves that does not answer is the sweep's.
+    pub(crate) async fn forget(&self, id: Uuid) -> bool {
+        match tokio::time::timeout(PATIENCE, self.store.erase_job(id)).await {
+            Ok(Ok(())) => return true,
+            Ok(Err(error)) => tracing::warn!(job = %id, %error, "a cancelled job's scan waits for the sweep"),
+            Err(_) => {
+                tracing::warn!(job = %id, "a cancelled job's scan waits for the sweep: the store does not answer")
+            }
+        }
+        false
     }
 }
 

@@ -6,6 +6,7 @@ test's own that is stopped and started, S3 is s3s-fs behind a proxy that answers
 not at all. TROUBLE_SECONDS makes the time without a database longer (60 in the long run).
 """
 
+import hashlib
 import http.client
 import http.server
 import os
@@ -17,7 +18,9 @@ import tempfile
 import threading
 import time
 
+import boto3
 import requests
+from botocore.config import Config
 
 from support import Postgres, Service, free_port, until
 
@@ -138,19 +141,29 @@ def database_away(folder):
 
 
 class Trouble(http.server.BaseHTTPRequestHandler):
-    """Passes a request on, or answers in its place: 500, 503, or the end of the connection."""
+    """Passes a request on, or answers in its place: 500, 503, the end of the connection, or nothing at all."""
 
     protocol_version = "HTTP/1.1"
     dice = random.Random(7)
     lock = threading.Lock()
     target = rate = 0
     faults = {"500": 0, "503": 0, "closed": 0}
+    # Requests that will find nobody who answers, and what lets them go.
+    silent = silenced = 0
+    over = threading.Event()
 
     def pass_on(self):
         with self.lock:
             fault = self.dice.choice(list(self.faults)) if self.dice.random() < self.rate else None
             if fault:
                 self.faults[fault] += 1
+            is_silent = Trouble.silent > 0
+            Trouble.silent -= is_silent
+            Trouble.silenced += is_silent
+        if is_silent:
+            self.over.wait(120)
+            self.close_connection = True
+            return
         body = self.rfile.read(int(self.headers.get("content-length") or 0))
         if fault == "closed":
             self.close_connection = True
@@ -201,6 +214,7 @@ def s3_in_trouble(folder):
     try:
         with Service(folder / "data", "--store-url", "s3://scans/ward", env=env) as service:
             until(lambda: service.get("/readyz").status_code == 200)
+            others_read(service, works(service))
             Trouble.rate = 0.1
             jobs = [works(service) for _ in range(2)]
             for job in jobs:
@@ -212,12 +226,51 @@ def s3_in_trouble(folder):
             assert time.time() - begun < 45
             Trouble.rate = 0
             works(service)
+            s3_is_silent(service)
     finally:
         s3.kill()
         s3.wait()
         proxy.shutdown()
     assert min(Trouble.faults.values()) > 2, Trouble.faults
     return sum(Trouble.faults.values())
+
+
+def others_read(service, job):
+    """boto3 finds the artefacts in the bucket, each with the bytes and the digest that the API tells."""
+    client = boto3.client(
+        "s3", endpoint_url=f"http://127.0.0.1:{Trouble.target}", region_name="us-east-1", aws_access_key_id="key",
+        aws_secret_access_key="secret", config=Config(s3={"addressing_style": "path"}))
+    prefix = f"ward/jobs/{job.split('/')[-1]}/artefacts/1/"
+    found = {item["Key"].removeprefix(prefix): item["Size"] for item in client.list_objects_v2(Bucket="scans", Prefix=prefix)["Contents"]}
+    told = service.get(f"{job}/artefacts").json()["items"]
+    assert found == {item["name"]: item["bytes"] for item in told}
+    for item in told:
+        read = client.get_object(Bucket="scans", Key=prefix + item["name"])["Body"].read()
+        assert "sha256:" + hashlib.sha256(read).hexdigest() == item["digest"], item["name"]
+
+
+def s3_is_silent(service):
+    """A store that takes connections and says nothing: asked again elsewhere, and nobody waits for ever."""
+    Trouble.silent = 1
+    begun = time.time()
+    works(service)
+    assert Trouble.silent == 0 and time.time() - begun < 60
+    running, cancelled = service.submit().headers["Location"], service.submit().headers["Location"]
+    until(lambda: service.get(running).json()["state"] == "running")
+    Trouble.silent = 1_000_000
+    begun = time.time()
+    assert service.get("/readyz").json()["code"] == "not_ready"
+    assert service.get(running).status_code == 200 and time.time() - begun < 8
+    refused(service.submit(), 503, "store.away")
+    assert time.time() - begun < 50
+    # Its scan cannot be read, or its result not be stored: it can be cancelled all the same.
+    assert service.session.post(f"{service.address}{cancelled}/cancel", timeout=10).ok
+    until(lambda: service.get(cancelled).json()["state"] == "cancelled")
+    Trouble.silent = 0
+    Trouble.over.set()
+    told = service.ended(running)
+    assert (told["state"], told["attempt"]) == ("succeeded", 1), told
+    works(service)
 
 
 def main():

@@ -31,6 +31,7 @@ const PYTHON_PACKAGES: &[&str] = &[
     "podman-compose==1.6.0",
     "dicomweb-client==0.61.2",
     "requests<3",
+    "boto3==1.44.8",
     "openapi-python-client==0.29.1",
     "gmsh==4.15.2",
     "tetgen==0.8.4",

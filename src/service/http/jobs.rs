@@ -424,7 +424,7 @@ async fn cancel(
     state.audit(&who, &trace.0, "job.cancel", &id.to_string()).await?;
     match row.state {
         JobState::Cancelled => {
-            state.store.erase_job(id).await?;
+            state.forget(id).await;
             Ok(Json(Job::from(row)).into_response())
         }
         JobState::Succeeded | JobState::Failed => Err(Problem::new(
@@ -475,11 +475,12 @@ async fn cancel_all(
         })?),
     };
     let ids = state.queue.cancel_all(&who.tenant, filter.state, before).await?;
+    let mut is_there = true;
     for id in &ids {
         state.audit(&who, &trace.0, "job.cancel", &id.to_string()).await?;
-        // A running one is erased by its worker.
-        if state.queue.is_known(*id).await? == Some(JobState::Cancelled) {
-            state.store.erase_job(*id).await?;
+        // A running one is erased by its worker. A store that does not answer is not waited for again.
+        if is_there && state.queue.is_known(*id).await? == Some(JobState::Cancelled) {
+            is_there = state.forget(*id).await;
         }
     }
     Ok(Json(CancelledAll { cancelled: ids.len() }))

@@ -11,8 +11,7 @@ use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::prefix::PrefixStore;
-use object_store::{ClientOptions, RetryConfig};
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{ClientOptions, MultipartUpload, ObjectStore, ObjectStoreExt as _, RetryConfig};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use std::path::Path;
@@ -23,8 +22,12 @@ use uuid::Uuid;
 
 /// How long one request to S3 is tried again (S3 answers 500 and 503 under load); beyond it the caller hears 503.
 const S3_PATIENCE: Duration = Duration::from_secs(20);
-/// A request to S3 that takes longer is tried again.
-const S3_REQUEST: Duration = Duration::from_secs(60);
+/// An answer of S3, or the next bytes of it, that takes longer is asked for again, on another connection: one that stands may
+/// stand for ever. There is no bound on a whole request, which a large object over a slow line would meet.
+const S3_SILENCE: Duration = Duration::from_secs(10);
+/// Larger objects go to S3 in parts of this size, each a request of its own whose answer must come within [`S3_SILENCE`]: at
+/// .8 MB/s. S3 takes parts of 5 MiB and more.
+const S3_PART: usize = 8 << 20;
 
 /// What the store can answer.
 #[derive(Debug, thiserror::Error)]
@@ -53,6 +56,13 @@ pub enum Error {
     /// A file of this machine.
     #[error("{0}")]
     Io(#[from] std::io::Error),
+}
+
+impl Error {
+    /// Whether the store did not answer, or not well: asked again later, it may.
+    pub fn is_away(&self) -> bool {
+        matches!(self, Self::Store(error) if !matches!(error, object_store::Error::NotFound { .. }))
+    }
 }
 
 /// One input file in the manifest.
@@ -145,7 +155,7 @@ impl Store {
         crate::tls::provide();
         let retry = RetryConfig { retry_timeout: S3_PATIENCE, ..RetryConfig::default() };
         let mut builder = AmazonS3Builder::new()
-            .with_client_options(ClientOptions::new().with_timeout(S3_REQUEST))
+            .with_client_options(ClientOptions::new().with_timeout_disabled().with_read_timeout(S3_SILENCE))
             .with_bucket_name(bucket)
             .with_retry(retry)
             .with_checksum_algorithm(object_store::aws::Checksum::SHA256);
@@ -191,9 +201,9 @@ impl Store {
     /// The store's.
     pub async fn put_input(&self, job: Uuid, input: &Input, files: Vec<(String, Vec<u8>)>) -> Result<(), Error> {
         for (_, bytes) in files {
-            self.objects.put(&input_key(job, &digest(&bytes)), bytes.into()).await?;
+            self.put(&input_key(job, &digest(&bytes)), bytes).await?;
         }
-        self.objects.put(&manifest_key(job, &input.digest), manifest_bytes(&input.files).into()).await?;
+        self.put(&manifest_key(job, &input.digest), manifest_bytes(&input.files)).await?;
         Ok(())
     }
 
@@ -253,8 +263,23 @@ impl Store {
     ) -> Result<(String, String), Error> {
         let key = Key::from_iter(["jobs", &job.to_string(), "artefacts", &fence.to_string(), name]);
         let digest = digest(&bytes);
-        self.objects.put(&key, bytes.into()).await?;
+        self.put(&key, bytes).await?;
         Ok((key.to_string(), digest))
+    }
+
+    /// Stores an object, in parts where it is large and the store is far.
+    async fn put(&self, key: &Key, bytes: Vec<u8>) -> Result<(), Error> {
+        if self.folder.is_some() || bytes.len() <= S3_PART {
+            self.objects.put(key, bytes.into()).await?;
+            return Ok(());
+        }
+        let mut upload = self.objects.put_multipart(key).await?;
+        let sent = in_parts(upload.as_mut(), bytes.into()).await;
+        if sent.is_err() {
+            // What this cannot take back, the bucket's rule for broken-off uploads does (docs/runbook.md).
+            let _ = tokio::time::timeout(S3_SILENCE, upload.abort()).await;
+        }
+        Ok(sent?)
     }
 
     /// Streams the bytes `range` of an object.
@@ -380,6 +405,15 @@ impl Store {
         self.objects.delete(&key).await?;
         Ok(())
     }
+}
+
+async fn in_parts(upload: &mut dyn MultipartUpload, mut rest: bytes::Bytes) -> object_store::Result<()> {
+    while !rest.is_empty() {
+        let part = rest.split_to(rest.len().min(S3_PART));
+        upload.put_part(part.into()).await?;
+    }
+    upload.complete().await?;
+    Ok(())
 }
 
 /// A stream that is hashed while it passes.

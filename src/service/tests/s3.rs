@@ -84,6 +84,30 @@ async fn a_job_lives_in_a_bucket_and_leaves_nothing_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_large_file_goes_in_parts_and_arrives_whole() {
+    let Some(s3) = s3() else { return };
+    let service = Service::with(|config| {
+        config.store_url = Some("s3://scans".to_owned());
+        config.s3 = settings(s3.port, "secret");
+    })
+    .await;
+    // Two whole parts and a bit, no two of them alike.
+    let large: Vec<u8> = (0..17_u32 << 20).map(|n| (n.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let form = reqwest::multipart::Form::new()
+        .text("plan", json!({}).to_string())
+        .part("input", reqwest::multipart::Part::bytes(large.clone()).file_name("scan/a.png"));
+    let sent = service.request(reqwest::Method::POST, "/v1/jobs").multipart(form).send().await.unwrap();
+    assert_eq!(sent.status(), reqwest::StatusCode::ACCEPTED);
+    let id = support::json(sent).await["id"].as_str().unwrap().to_owned();
+    let job = service.ended(&id).await;
+    assert_eq!(job["state"], "succeeded", "{job}");
+    let stored = support::files(&s3.folder.path().join("scans"));
+    let whole = stored.iter().filter(|file| std::fs::metadata(file).unwrap().len() == large.len() as u64);
+    assert_eq!(whole.map(|file| std::fs::read(file).unwrap() == large).collect::<Vec<_>>(), [true]);
+    service.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_wrong_secret_accepts_nothing() {
     let Some(s3) = s3() else { return };
     let service = Service::with(|config| {

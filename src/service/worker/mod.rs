@@ -25,7 +25,7 @@ use crate::error::Problem;
 use crate::media::media_type;
 use crate::queue::submit::is_variant;
 use crate::queue::{ArtefactRow, Claim, Closing, JobState, Published, Queue, Verdict, WorkerRow};
-use crate::store::Store;
+use crate::store::{self, Store};
 use crate::traces::{Course, Traces};
 use child::{Child, Ended, Step};
 use folder::Folder;
@@ -109,13 +109,18 @@ impl Worker {
     /// `None`: the lease was lost on the way.
     async fn run(&self, claim: &Claim, held: &Held, course: &mut Course<'_>) -> anyhow::Result<Option<Closing>> {
         let folder = Folder::make(&self.owner, claim).await?;
-        if let Err(error) = self.store.fetch_input(claim.uuid(), &claim.input_digest, &folder.input()).await {
-            // Erased meanwhile, or cancelled: the lease says which.
-            return match held.verdict_now().await {
-                Verdict::Run => Err(error.into()),
-                Verdict::Cancel => Ok(Some(Closing::Cancelled)),
-                Verdict::Lost => Ok(None),
-            };
+        let input = folder.input();
+        let fetch = || self.store.fetch_input(claim.uuid(), &claim.input_digest, &input);
+        match self.patiently(claim, held, fetch).await {
+            Ok(Some(())) => {}
+            Ok(None) => return Ok(given_up(held.verdict())),
+            Err(error) => {
+                // Erased meanwhile, or cancelled: the lease says which.
+                return match held.verdict_now().await {
+                    Verdict::Run => Err(error.into()),
+                    over => Ok(given_up(over)),
+                };
+            }
         }
         tokio::fs::write(folder.plan(), &claim.plan).await?;
         if let Err(error) = self.fetch_earlier(claim, &folder).await {
@@ -125,9 +130,9 @@ impl Worker {
         let mut child = Child::start(&self.config, &folder, claim, self.memory.each())?;
         let ended = self.watch(&mut child, held, claim, course).await?;
         let closing = match ended {
-            Some(Ended::Done) => match held.verdict() {
-                Verdict::Lost => None,
-                _ => Some(self.publish(claim, &folder).await?),
+            Some(Ended::Done) => match self.patiently(claim, held, || self.publish(claim, &folder)).await? {
+                Some(closing) => Some(closing),
+                None => given_up(held.verdict()),
             },
             Some(Ended::Problem(problem)) => Some(Closing::Failed(problem)),
             Some(Ended::Crashed(how)) => Some(Closing::Crashed(how)),
@@ -138,6 +143,33 @@ impl Worker {
         };
         folder.remove().await;
         Ok(closing)
+    }
+
+    /// What the store answers, asked for until it does: that it is away for a while must not cost a job one of its attempts, and
+    /// a result that was computed is not thrown away for it. `None`: the job is cancelled or lost, or the service stops.
+    async fn patiently<T, F>(&self, claim: &Claim, held: &Held, ask: impl Fn() -> F) -> Result<Option<T>, store::Error>
+    where
+        F: Future<Output = Result<T, store::Error>>,
+    {
+        let mut verdict = held.subscribe();
+        let answer = async {
+            loop {
+                match ask().await {
+                    Err(error) if error.is_away() => {
+                        tracing::warn!(job = %claim.id, %error, "the store does not answer, trying again");
+                        tokio::select! {
+                            () = self.shutdown.cancelled() => return Ok(None),
+                            () = tokio::time::sleep(PAUSE) => {}
+                        }
+                    }
+                    answer => return answer.map(Some),
+                }
+            }
+        };
+        tokio::select! {
+            _ = verdict.wait_for(|verdict| *verdict != Verdict::Run) => Ok(None),
+            answer = answer => answer,
+        }
     }
 
     /// What an earlier job on the same scan left for this one. A variant has another scan: none.
@@ -230,11 +262,11 @@ impl Worker {
     }
 
     /// Puts every file of the finished folder into the store.
-    async fn publish(&self, claim: &Claim, folder: &Folder) -> anyhow::Result<Closing> {
+    async fn publish(&self, claim: &Claim, folder: &Folder) -> Result<Closing, store::Error> {
         let mut artefacts = Vec::new();
         for (name, path) in folder.artefacts().await? {
             let bytes = tokio::fs::read(&path).await?;
-            let size = i64::try_from(bytes.len())?;
+            let size = i64::try_from(bytes.len()).unwrap_or(i64::MAX);
             let (object_key, digest) = self.store.put_artefact(claim.uuid(), claim.fence, &name, bytes).await?;
             artefacts.push(ArtefactRow {
                 media_type: media_type(&name).to_owned(),
@@ -288,6 +320,15 @@ impl Worker {
             tracing::warn!(job = %claim.id, %error, "files left behind; the sweep at the next start takes them");
         }
         reached
+    }
+}
+
+/// How a hold ends that is given up before its job has ended.
+fn given_up(verdict: Verdict) -> Option<Closing> {
+    match verdict {
+        Verdict::Run => Some(Closing::HandedBack),
+        Verdict::Cancel => Some(Closing::Cancelled),
+        Verdict::Lost => None,
     }
 }
 
