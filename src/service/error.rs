@@ -165,14 +165,7 @@ impl From<sqlx::Error> for Problem {
             tracing::error!(cause = %text, "database full");
             return Self::storage_full("The disk of the database is full. Nothing was accepted; tell the operator.");
         }
-        let away = matches!(
-            error,
-            sqlx::Error::PoolTimedOut
-                | sqlx::Error::PoolClosed
-                | sqlx::Error::WorkerCrashed
-                | sqlx::Error::Io(_)
-                | sqlx::Error::Tls(_)
-        );
+        let away = crate::db::is_away(&error);
         let code = error.as_database_error().and_then(|e| e.code().map(|c| c.into_owned()));
         // Classes 08 and 57 of PostgreSQL: the connection broke, or the server is shutting down or starting.
         if away || code.is_some_and(|c| c.len() == 5 && (c.starts_with("08") || c.starts_with("57"))) {

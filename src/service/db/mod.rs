@@ -8,12 +8,16 @@
 //! Limits: SQLite serves the processes of one machine; PostgreSQL any number of machines. Only the database's own
 //! clock is ever compared, never a node's.
 
+mod grouped;
 mod postgres;
+mod sizes;
 mod sqlite;
 mod statement;
 mod together;
 mod value;
 
+pub(crate) use grouped::Grouped;
+pub(crate) use sizes::{Sizes, placeholders};
 pub(crate) use together::{MOST, Together};
 pub(crate) use value::args;
 pub use value::{Row, Tx, Value};
@@ -35,6 +39,14 @@ pub enum Scope<'a> {
     Tenant(&'a str),
 }
 
+/// A state of the database: another one after every commit of anybody. Only equality means anything.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Version {
+    /// Which connection was asked: each counts by itself.
+    connection: u64,
+    count: i64,
+}
+
 /// What a unit of writing gives back.
 pub type Output = Box<dyn Any + Send>;
 /// A unit of writing: all of it is committed, or nothing.
@@ -51,6 +63,9 @@ pub trait Database: Send + Sync + std::fmt::Debug {
 
     /// Rows of one statement that writes, in a transaction of its own; returns after the commit is durable.
     async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>>;
+
+    /// The state that a read would see now; `None` where that is not to be had for less than a read.
+    fn version(&self) -> sqlx::Result<Option<Version>>;
 
     /// The same database for a thread with a runtime of its own.
     async fn for_thread(&self) -> sqlx::Result<Arc<dyn Database>>;
@@ -126,12 +141,28 @@ impl Db {
         Ok(self.0.change(scope, sql, args).await?.into_iter().next())
     }
 
+    /// Rows of one statement that writes, in a transaction of its own.
+    ///
+    /// # Errors
+    /// The database's; nothing was written.
+    pub async fn changes(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
+        self.0.change(scope, sql, args).await
+    }
+
     /// One statement in a transaction of its own; the number of rows it touched.
     ///
     /// # Errors
     /// The database's.
     pub async fn run(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<u64> {
         self.write(scope, move |tx| Box::pin(async move { tx.run(sql, args).await })).await
+    }
+
+    /// See [`Database::version`].
+    ///
+    /// # Errors
+    /// The database's.
+    pub fn version(&self) -> sqlx::Result<Option<Version>> {
+        self.0.version()
     }
 
     /// The same database for a thread with a runtime of its own.
@@ -170,6 +201,17 @@ impl Db {
     pub async fn close(&self) {
         self.0.close().await;
     }
+}
+
+/// Whether the database could not be reached, by its own fault or the way's.
+pub(crate) fn is_away(error: &sqlx::Error) -> bool {
+    use sqlx::Error::{Io, PoolClosed, PoolTimedOut, Tls, WorkerCrashed};
+    matches!(error, PoolTimedOut | PoolClosed | WorkerCrashed | Io(_) | Tls(_))
+}
+
+/// The same error for another caller of a group: what matters is that it is the storage's and not the caller's.
+fn copy(error: &sqlx::Error) -> sqlx::Error {
+    sqlx::Error::Io(std::io::Error::other(error.to_string()))
 }
 
 /// What a unit of writing gave back.

@@ -5,7 +5,7 @@
 //! skip rows that another worker has locked. LISTEN carries hints only; nothing is lost when one is.
 
 use super::value::bound;
-use super::{Database, Output, Row, Scope, Tx, Value, Work, migration_fault};
+use super::{Database, Output, Row, Scope, Tx, Value, Version, Work, migration_fault};
 use anyhow::Context as _;
 use async_trait::async_trait;
 use sqlx::Connection as _;
@@ -20,6 +20,8 @@ use uuid::Uuid;
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How long a connection that answered is taken to be there still.
 const TRUSTED: Duration = Duration::from_secs(1);
+/// Statements that a connection keeps prepared: all there are, with those over several rows in each size.
+const STATEMENTS: usize = 256;
 /// The channel of hints.
 const CHANNEL: &str = "vasculum_job";
 /// Ids in one notice: a payload holds less than 8000 bytes.
@@ -38,7 +40,7 @@ impl Postgres {
     /// Connects and applies the migrations (one process at a time: sqlx takes an advisory lock).
     pub(super) async fn open(url: &str, connections: u32) -> anyhow::Result<Self> {
         let options = PgConnectOptions::from_str(url).context("the database address cannot be read")?;
-        let options = options.application_name("vasculum");
+        let options = options.application_name("vasculum").statement_cache_capacity(STATEMENTS);
         let place = format!("{} at {}", options.get_database().unwrap_or("postgres"), options.get_host());
         let pool =
             pool(&options, connections).await.with_context(|| format!("cannot connect to the database {place}"))?;
@@ -116,6 +118,10 @@ impl Database for Postgres {
     async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
         // One statement is a transaction, whether it reads or writes.
         self.read(scope, sql, args).await
+    }
+
+    fn version(&self) -> sqlx::Result<Option<Version>> {
+        Ok(None)
     }
 
     async fn for_thread(&self) -> sqlx::Result<Arc<dyn Database>> {

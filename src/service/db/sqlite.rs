@@ -11,7 +11,7 @@
 //! for more than [`QUICK`] steps is begun again where it may block. sqlx still applies the migrations.
 
 use super::statement::{fault, is_interruption, rows, run};
-use super::{Database, Output, Row, Scope, Tx, Value, Work, migration_fault, unboxed};
+use super::{Database, Output, Row, Scope, Tx, Value, Version, Work, copy, migration_fault, unboxed};
 use anyhow::Context as _;
 use async_trait::async_trait;
 use rusqlite::{Connection, OpenFlags};
@@ -174,11 +174,13 @@ struct Readers {
     file: PathBuf,
     turns: Semaphore,
     idle: Mutex<Vec<Connection>>,
+    /// The one that is asked for versions, and which one since the start it is.
+    versions: Mutex<(u64, Option<Connection>)>,
 }
 
 impl Readers {
     fn new(file: &Path, most: usize) -> Self {
-        Self { file: file.to_owned(), turns: Semaphore::new(most), idle: Mutex::default() }
+        Self { file: file.to_owned(), turns: Semaphore::new(most), idle: Mutex::default(), versions: Mutex::default() }
     }
 
     async fn rows(self: &Arc<Self>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
@@ -212,6 +214,25 @@ impl Readers {
         if interrupted { Ok(None) } else { rows.map(Some) }
     }
 
+    /// SQLite counts for each connection the commits of all others that it meets: some microseconds, no page is read.
+    fn version(&self) -> sqlx::Result<Version> {
+        let mut versions = self.versions.lock().unwrap_or_else(PoisonError::into_inner);
+        let (number, held) = &mut *versions;
+        // One that meets a fault is not put back.
+        let connection = match held.take() {
+            Some(connection) => connection,
+            None => {
+                *number += 1;
+                opened(&self.file, OpenFlags::SQLITE_OPEN_READ_ONLY)?
+            }
+        };
+        let asked =
+            connection.prepare_cached("PRAGMA data_version").and_then(|mut s| s.query_row([], |row| row.get(0)));
+        let count = asked.map_err(fault)?;
+        *held = Some(connection);
+        Ok(Version { connection: *number, count })
+    }
+
     fn idle(&self) -> std::sync::MutexGuard<'_, Vec<Connection>> {
         // Connections are whole or not there.
         self.idle.lock().unwrap_or_else(PoisonError::into_inner)
@@ -220,6 +241,7 @@ impl Readers {
     fn close(&self) {
         self.turns.close();
         self.idle().clear();
+        self.versions.lock().unwrap_or_else(PoisonError::into_inner).1 = None;
     }
 }
 
@@ -228,11 +250,6 @@ fn refuse(units: impl Iterator<Item = Unit>, error: &sqlx::Error) {
         // An error means that the caller went away.
         let _ = unit.reply.send(Err(copy(error)));
     }
-}
-
-/// The same error for another caller of the group: what matters is that it is the storage's and not the caller's.
-fn copy(error: &sqlx::Error) -> sqlx::Error {
-    sqlx::Error::Io(std::io::Error::other(error.to_string()))
 }
 
 #[async_trait]
@@ -250,6 +267,10 @@ impl Database for Sqlite {
     async fn change(&self, scope: Scope<'_>, sql: &'static str, args: Vec<Value>) -> sqlx::Result<Vec<Row>> {
         let work: Work = Box::new(move |tx| Box::pin(async move { Ok(Box::new(tx.rows(sql, args).await?) as Output) }));
         unboxed(self.write(scope, work).await?)
+    }
+
+    fn version(&self) -> sqlx::Result<Option<Version>> {
+        self.readers.version().map(Some)
     }
 
     async fn for_thread(&self) -> sqlx::Result<Arc<dyn Database>> {
@@ -304,6 +325,25 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::db::args;
+
+    #[tokio::test]
+    async fn every_commit_of_anybody_is_another_version() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let file = folder.path().join("queue.db");
+        let (one, two) = (Sqlite::open(&file).await.unwrap(), Sqlite::open(&file).await.unwrap());
+        let mut seen = vec![one.version().unwrap().unwrap()];
+        for (k, writer) in [&one, &two, &one, &two].into_iter().enumerate() {
+            let add = "INSERT INTO tenant (id, name, created_at) VALUES ($1, 't', 0)";
+            writer.change(Scope::System, add, args![k.to_string()]).await.unwrap();
+            seen.push(one.version().unwrap().unwrap());
+            assert_eq!(one.version().unwrap(), seen.last().copied(), "nothing was committed between");
+        }
+        one.readers.versions.lock().unwrap().1 = None;
+        seen.push(one.version().unwrap().unwrap());
+        for (k, version) in seen.iter().enumerate() {
+            assert!(!seen[..k].contains(version), "{seen:?}");
+        }
+    }
 
     #[tokio::test]
     async fn a_long_read_is_begun_again_where_it_may_block() {

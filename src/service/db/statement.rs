@@ -11,6 +11,7 @@ use std::sync::Arc;
 fn words(sql: &str) -> String {
     sql.replace("now_ms()", "CAST(unixepoch('subsec') * 1000 AS INTEGER)")
         .replace(" FOR UPDATE SKIP LOCKED", "")
+        .replace(" FOR NO KEY UPDATE", "")
         .replace(" FOR UPDATE", "")
 }
 

@@ -46,29 +46,31 @@ impl<K: Ord + Clone, V: Clone> Together<K, V> {
     {
         let (sender, mut answer) = oneshot::channel();
         self.lock().push((key.clone(), sender));
-        loop {
-            tokio::select! {
+        let told = loop {
+            let turn = tokio::select! {
                 biased;
-                told = &mut answer => match told {
-                    Ok(row) => return Ok(row),
-                    // Whoever asked for us met a fault or went away: ask for ourselves.
-                    Err(_) => return Ok(read(vec![key.clone()]).await?.remove(&key)),
-                },
-                turn = self.turns.acquire() => {
-                    let _turn = turn.map_err(|_| sqlx::Error::PoolClosed)?;
-                    let batch = self.batch(&alike);
-                    let mut keys: Vec<K> = batch.iter().map(|(key, _)| key.clone()).collect();
-                    keys.sort_unstable();
-                    keys.dedup();
-                    if !keys.is_empty() {
-                        let rows = read(keys).await?;
-                        for (key, sender) in batch {
-                            // An error means that the caller went away.
-                            let _ = sender.send(rows.get(&key).cloned());
-                        }
-                    }
-                }
+                told = &mut answer => break told,
+                turn = self.turns.acquire() => turn.map_err(|_| sqlx::Error::PoolClosed)?,
+            };
+            let batch = self.batch(&alike);
+            if batch.is_empty() {
+                // Ours is under way with another batch: taking turns on and on would only keep a processor busy.
+                drop(turn);
+                break answer.await;
             }
+            let mut keys: Vec<K> = batch.iter().map(|(key, _)| key.clone()).collect();
+            keys.sort_unstable();
+            keys.dedup();
+            let rows = read(keys).await?;
+            for (key, sender) in batch {
+                // An error means that the caller went away.
+                let _ = sender.send(rows.get(&key).cloned());
+            }
+        };
+        match told {
+            Ok(row) => Ok(row),
+            // Whoever asked for us met a fault or went away: ask for ourselves.
+            Err(_) => Ok(read(vec![key.clone()]).await?.remove(&key)),
         }
     }
 

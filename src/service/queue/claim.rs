@@ -5,7 +5,8 @@
 //! with 10^3 and 10^6 jobs queued. A tenant at its cap of running jobs is passed over whole, never scanned.
 
 use super::{LEASE_MS, Queue};
-use crate::db::{Row, Scope, Tx, args};
+use crate::db::{Db, MOST, Row, Scope, Tx, args};
+use std::sync::LazyLock;
 use uuid::Uuid;
 
 /// A job that this worker holds until its lease runs out.
@@ -90,39 +91,50 @@ pub enum Verdict {
     Lost,
 }
 
-/// The tenant whose best job is the best of all tenants that may run one more.
-const NEXT_TENANT: &str = "SELECT tenant, max_running FROM (\
+/// The tenant whose best job is the best of all tenants that may run one more, and the one after it: up to the best job of
+/// that one the first one's jobs are the best of all.
+const NEXT_TENANTS: &str = "SELECT tenant, max_running, best FROM (\
     SELECT t.id AS tenant, t.max_running AS max_running, (SELECT j.rank FROM job j WHERE j.tenant = t.id \
         AND j.state = 'queued' AND j.run_at <= now_ms() AND j.memory_mb <= $1 ORDER BY j.rank, j.id LIMIT 1) AS best \
     FROM tenant t WHERE t.max_running IS NULL OR t.max_running > \
         (SELECT COUNT(*) FROM job r WHERE r.tenant = t.id AND r.state = 'running')) AS ready \
-    WHERE best IS NOT NULL ORDER BY best LIMIT 1";
+    WHERE best IS NOT NULL ORDER BY best LIMIT 2";
 
-const TAKE: &str = "UPDATE job SET state = 'running', attempt = attempt + 1, fence = fence + 1, lease_owner = $1, \
-    stage = NULL, progress = 0, eta_s = NULL, revision = revision + 1, started_at = now_ms(), \
-    lease_until = now_ms() + $2 WHERE id = (SELECT id FROM job WHERE tenant = $3 AND state = 'queued' \
-    AND run_at <= now_ms() AND memory_mb <= $4 ORDER BY rank, id LIMIT 1 FOR UPDATE SKIP LOCKED) RETURNING *";
+/// What a claim of several jobs says before and after their number. The number is written out, so that the planner knows it:
+/// of a number that it does not know it expects a tenth of all that wait, and reads the whole table for them.
+const TAKE: [&str; 2] = [
+    "WITH next (next_id) AS MATERIALIZED (SELECT id FROM job WHERE tenant = $3 AND state = 'queued' \
+     AND run_at <= now_ms() AND memory_mb <= $4 AND rank <= $5 ORDER BY rank, id LIMIT ",
+    " FOR UPDATE SKIP LOCKED) UPDATE job SET state = 'running', attempt = attempt + 1, fence = fence + 1, \
+     lease_owner = $1, stage = NULL, progress = 0, eta_s = NULL, revision = revision + 1, started_at = now_ms(), \
+     lease_until = now_ms() + $2 FROM next WHERE id = next_id RETURNING *",
+];
+static TAKES: LazyLock<[String; MOST]> =
+    LazyLock::new(|| std::array::from_fn(|k| format!("{}{}{}", TAKE[0], k + 1, TAKE[1])));
+
+/// What one slot asks for.
+#[derive(Clone, Debug)]
+pub(super) struct Wanted {
+    owner: String,
+    room: Room,
+}
 
 impl Queue {
     /// Claims the next job that may run and fits into `room`, or `None`.
     ///
+    /// Slots of one worker that ask at the same time claim together. No job passes another one by that: those that are
+    /// claimed together are the next ones.
+    ///
     /// # Errors
     /// The database's.
     pub async fn claim(&self, owner: &str, room: Room) -> sqlx::Result<Option<Claim>> {
-        let memory = match room {
-            Room::Any => i64::MAX,
-            Room::Memory(mb) => mb,
+        let alike = |a: &Wanted, b: &Wanted| a.room == b.room && a.owner == b.owner;
+        let db = self.db().clone();
+        let write = move |wanted: Vec<Wanted>| {
+            let db = db.clone();
+            async move { claimed(&db, &wanted).await }
         };
-        // An idle worker only reads: it takes no write lock and costs no commit.
-        let Some(next) = self.db().row(Scope::System, NEXT_TENANT, args![memory]).await? else { return Ok(None) };
-        let row = if next.get::<Option<i64>>("max_running")?.is_none() {
-            let tenant: String = next.get("tenant")?;
-            self.db().change(Scope::System, TAKE, args![owner, LEASE_MS, tenant, memory]).await?
-        } else {
-            let owner = owner.to_owned();
-            self.db().write(Scope::System, move |tx| Box::pin(async move { take(tx, &owner, memory).await })).await?
-        };
-        let claim = row.as_ref().map(Claim::of).transpose()?;
+        let claim = self.claims.call(Wanted { owner: owner.to_owned(), room }, alike, write).await?;
         if let Some(claim) = &claim {
             self.hint(claim.uuid());
         }
@@ -171,20 +183,95 @@ impl Queue {
     }
 }
 
-/// The next job, of whatever tenant it is now; a tenant's cap is kept.
-async fn take(tx: &mut Tx<'_>, owner: &str, memory: i64) -> sqlx::Result<Option<Row>> {
-    let Some(next) = tx.row(NEXT_TENANT, args![memory]).await? else { return Ok(None) };
-    let tenant: String = next.get("tenant")?;
-    if let Some(most) = next.get::<Option<i64>>("max_running")? {
-        // Two workers may both have seen the last free place: the tenant's row lets one of them count at a time.
-        tx.row("SELECT id FROM tenant WHERE id = $1 FOR UPDATE", args![&tenant]).await?;
-        let count = "SELECT COUNT(*) AS n FROM job WHERE tenant = $1 AND state = 'running'";
-        let running: i64 = tx.row(count, args![&tenant]).await?.map_or(Ok(0), |row| row.get("n"))?;
-        if running >= most {
-            return Ok(None);
+/// Jobs for slots that ask for the same, in their order; `None` for the last ones where there are not enough.
+async fn claimed(db: &Db, wanted: &[Wanted]) -> sqlx::Result<Vec<Option<Claim>>> {
+    let mut claims: Vec<Option<Claim>> = Vec::with_capacity(wanted.len());
+    if let Some(Wanted { owner, room }) = wanted.first() {
+        let memory = match room {
+            Room::Any => i64::MAX,
+            Room::Memory(mb) => *mb,
+        };
+        while claims.len() < wanted.len() {
+            // What an earlier round claimed must not be lost by a fault of a later one: its slots work on it.
+            let some = match next(db, owner, memory, wanted.len() - claims.len()).await {
+                Ok(some) => some,
+                Err(error) if claims.is_empty() => return Err(error),
+                Err(_) => break,
+            };
+            if some.is_empty() {
+                break;
+            }
+            claims.extend(some.into_iter().map(Some));
         }
     }
-    tx.row(TAKE, args![owner, LEASE_MS, &tenant, memory]).await
+    claims.resize(wanted.len(), None);
+    Ok(claims)
+}
+
+/// The next jobs, at least one if there is one, at most so many.
+async fn next(db: &Db, owner: &str, memory: i64, most: usize) -> sqlx::Result<Vec<Claim>> {
+    // An idle worker only reads: it takes no write lock and costs no commit.
+    let tenants = db.rows(Scope::System, NEXT_TENANTS, args![memory]).await?;
+    if tenants.is_empty() {
+        return Ok(Vec::new());
+    }
+    let taking = Taking { owner: owner.to_owned(), memory, most };
+    let work = db.write(Scope::System, move |tx| Box::pin(async move { taking.taken(tx, tenants).await }));
+    work.await?.iter().map(Claim::of).collect()
+}
+
+/// How many jobs, and for whom.
+struct Taking {
+    owner: String,
+    memory: i64,
+    most: usize,
+}
+
+impl Taking {
+    /// Jobs of one tenant after the other in one transaction, `tenants` being what [`NEXT_TENANTS`] said before it.
+    async fn taken(&self, tx: &mut Tx<'_>, mut tenants: Vec<Row>) -> sqlx::Result<Vec<Row>> {
+        let mut rows = Vec::new();
+        while let Some(first) = tenants.first() {
+            let (tenant, cap): (String, Option<i64>) = (first.get("tenant")?, first.get("max_running")?);
+            if cap.is_some() && !rows.is_empty() {
+                // The row of one capped tenant at most is locked, so that two workers never wait for each other's.
+                break;
+            }
+            let left = self.most - rows.len();
+            let places = match cap {
+                Some(cap) => left.min(places(tx, &tenant, cap).await?),
+                None => left,
+            };
+            let until = tenants.get(1).map_or(Ok(i64::MAX), |second| second.get("best"))?;
+            let mut some = self.of_tenant(tx, &tenant, until, places).await?;
+            if some.is_empty() && places > 0 && until < i64::MAX {
+                // Another worker holds those up to the next tenant's: one of the later ones is better than none.
+                some = self.of_tenant(tx, &tenant, i64::MAX, 1).await?;
+            }
+            let raced = some.is_empty();
+            rows.extend(some);
+            if raced || cap.is_some() || rows.len() >= self.most {
+                break;
+            }
+            tenants = tx.rows(NEXT_TENANTS, args![self.memory]).await?;
+        }
+        Ok(rows)
+    }
+
+    /// At most so many jobs of a tenant with ranks up to `until`.
+    async fn of_tenant(&self, tx: &mut Tx<'_>, tenant: &str, until: i64, most: usize) -> sqlx::Result<Vec<Row>> {
+        let Some(sql) = most.checked_sub(1).and_then(|k| TAKES.get(k)) else { return Ok(Vec::new()) };
+        tx.rows(sql, args![&self.owner, LEASE_MS, tenant, self.memory, until]).await
+    }
+}
+
+/// How many more jobs of a tenant may run now.
+async fn places(tx: &mut Tx<'_>, tenant: &str, cap: i64) -> sqlx::Result<usize> {
+    // Two workers may both have seen the last free place: the tenant's row lets one of them count at a time.
+    tx.row("SELECT id FROM tenant WHERE id = $1 FOR NO KEY UPDATE", args![tenant]).await?;
+    let count = "SELECT COUNT(*) AS n FROM job WHERE tenant = $1 AND state = 'running'";
+    let running: i64 = tx.row(count, args![tenant]).await?.map_or(Ok(0), |row| row.get("n"))?;
+    Ok(usize::try_from(cap - running).unwrap_or(0))
 }
 
 async fn beaten(tx: &mut Tx<'_>, id: Uuid, fence: i64, beat: &Beat) -> sqlx::Result<Verdict> {

@@ -1,9 +1,10 @@
-//! Ending a job: one transaction each, guarded by id, fence and `state = 'running'`.
+//! Ending jobs, guarded by id, fence and `state = 'running'`: one transaction for all ends that wait at the same time.
 
 use super::{ArtefactRow, Claim, JobState, Queue};
-use crate::db::{Scope, Tx, args};
+use crate::db::{Scope, Sizes, Tx, Value, args, placeholders};
 use crate::error::Problem;
 use axum::http::StatusCode;
+use std::collections::BTreeMap;
 
 /// A crashed attempt waits this long times the square of its number, ms: a full disk or a passing shortage of memory
 /// must not use up every attempt within a moment.
@@ -62,9 +63,15 @@ impl Queue {
     /// # Errors
     /// The database's; nothing was written.
     pub async fn close(&self, claim: &Claim, closing: &Closing) -> sqlx::Result<Option<JobState>> {
-        let (held, end) = (claim.clone(), closing.clone());
-        let state =
-            self.db().write(Scope::System, move |tx| Box::pin(async move { closed(tx, &held, &end).await })).await?;
+        let db = self.db().clone();
+        let write = move |ends: Vec<End>| {
+            let db = db.clone();
+            async move {
+                let work = db.write(Scope::System, move |tx| Box::pin(async move { closed(tx, &ends).await }));
+                work.await
+            }
+        };
+        let state = self.ends.call(End::of(claim, closing), |_, _| true, write).await?;
         if state.is_some() {
             self.hint(claim.uuid());
         }
@@ -72,48 +79,99 @@ impl Queue {
     }
 }
 
-/// A cancel that comes in between wins, so the statement itself looks whether there is one.
-const END: &str = "UPDATE job SET state = CASE WHEN cancel_requested = 1 THEN 'cancelled' ELSE $3 END, \
-    error = CASE WHEN cancel_requested = 0 THEN $4 END, result = CASE WHEN cancel_requested = 0 THEN $5 END, \
-    stage = CASE WHEN cancel_requested = 0 AND $3 = 'failed' THEN stage END, \
-    progress = CASE WHEN cancel_requested = 1 THEN progress WHEN $3 = 'succeeded' THEN 1 WHEN $3 = 'queued' THEN 0 \
-        ELSE progress END, \
-    finished_at = CASE WHEN cancel_requested = 1 OR $3 <> 'queued' THEN now_ms() END, \
-    lease_owner = NULL, lease_until = NULL, eta_s = NULL, attempt = attempt - $6, run_at = now_ms() + $7, \
-    revision = revision + 1 WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING state";
+/// The end of one hold.
+#[derive(Clone, Debug)]
+pub(super) struct End {
+    id: String,
+    fence: i64,
+    state: JobState,
+    error: Option<String>,
+    result: Option<String>,
+    is_handed_back: bool,
+    pause_ms: i64,
+    artefacts: Vec<ArtefactRow>,
+}
 
-async fn closed(tx: &mut Tx<'_>, claim: &Claim, closing: &Closing) -> sqlx::Result<Option<JobState>> {
-    let (state, error) = outcome(claim, closing);
-    let pause = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) {
-        BACKOFF_MS * claim.attempt * claim.attempt
-    } else {
-        0
-    };
-    let values = args![
-        &claim.id,
-        claim.fence,
-        state.as_str(),
-        error.map(|e| e.body()),
-        result_json(closing),
-        matches!(closing, Closing::HandedBack),
-        pause,
-    ];
-    let Some(row) = tx.row(END, values).await? else { return already(tx, claim).await };
-    let state = JobState::of(row.get("state")?)?;
-    if let (JobState::Succeeded, Closing::Succeeded(published)) = (state, closing) {
-        for artefact in &published.artefacts {
-            name_artefact(tx, &claim.id, artefact).await?;
+impl End {
+    fn of(claim: &Claim, closing: &Closing) -> Self {
+        let (state, error) = outcome(claim, closing);
+        let pause_ms = if matches!(closing, Closing::Crashed(_) | Closing::OutOfMemory(_)) {
+            BACKOFF_MS * claim.attempt * claim.attempt
+        } else {
+            0
+        };
+        Self {
+            id: claim.id.clone(),
+            fence: claim.fence,
+            state,
+            error: error.map(|e| e.body()),
+            result: result_json(closing),
+            is_handed_back: matches!(closing, Closing::HandedBack),
+            pause_ms,
+            artefacts: match closing {
+                Closing::Succeeded(published) => published.artefacts.clone(),
+                _ => Vec::new(),
+            },
         }
     }
-    Ok(Some(state))
+
+    fn values(&self) -> [Value; 7] {
+        [
+            Value::from(&self.id),
+            Value::from(self.fence),
+            Value::from(self.state.as_str()),
+            Value::from(&self.error),
+            Value::from(&self.result),
+            Value::from(self.is_handed_back),
+            Value::from(self.pause_ms),
+        ]
+    }
+}
+
+/// A cancel that comes in between wins, so the statement itself looks whether there is one.
+const END: &str = "UPDATE job SET state = CASE WHEN cancel_requested = 1 THEN 'cancelled' ELSE e_state END, \
+    error = CASE WHEN cancel_requested = 0 THEN e_error END, result = CASE WHEN cancel_requested = 0 THEN e_result END, \
+    stage = CASE WHEN cancel_requested = 0 AND e_state = 'failed' THEN stage END, \
+    progress = CASE WHEN cancel_requested = 1 THEN progress WHEN e_state = 'succeeded' THEN 1 WHEN e_state = 'queued' THEN 0 \
+        ELSE progress END, \
+    finished_at = CASE WHEN cancel_requested = 1 OR e_state <> 'queued' THEN now_ms() END, \
+    lease_owner = NULL, lease_until = NULL, eta_s = NULL, attempt = attempt - e_back, run_at = now_ms() + e_pause, \
+    revision = revision + 1 FROM ended WHERE e_row = 1 AND id = e_id AND fence = e_fence AND state = 'running' RETURNING id, fence, state";
+static ENDS: Sizes = Sizes::new(|holds| {
+    let values = placeholders(holds, 7);
+    format!("WITH ended (e_id, e_fence, e_state, e_error, e_result, e_back, e_pause, e_row) AS (VALUES {values}) {END}")
+});
+
+/// Ends holds in one transaction; the state that each reached, in their order.
+async fn closed(tx: &mut Tx<'_>, ends: &[End]) -> sqlx::Result<Vec<Option<JobState>>> {
+    let mut order: Vec<&End> = ends.iter().collect();
+    // Rows are locked in one order by everybody who locks several.
+    order.sort_by(|a, b| a.id.cmp(&b.id));
+    let mut reached: BTreeMap<(String, i64), JobState> = BTreeMap::new();
+    for (sql, values) in ENDS.over(&order.into_iter().map(End::values).collect::<Vec<_>>()) {
+        for row in tx.rows(sql, values).await? {
+            reached.insert((row.get("id")?, row.get("fence")?), JobState::of(row.get("state")?)?);
+        }
+    }
+    let of = |end: &End| reached.get(&(end.id.clone(), end.fence)).copied();
+    let done = |end: &&End| end.state == JobState::Succeeded && of(end) == Some(JobState::Succeeded);
+    name_artefacts(tx, ends.iter().filter(done)).await?;
+    let mut states = Vec::with_capacity(ends.len());
+    for end in ends {
+        states.push(match of(end) {
+            Some(state) => Some(state),
+            None => already(tx, end).await?,
+        });
+    }
+    Ok(states)
 }
 
 /// The state in which this very hold ended earlier, if it did. A commit whose answer was lost (the database stopped, the
 /// connection broke) is asked for again: it must not look like a lost lease, or the worker would drop files that the
 /// table names. The kill storm found that. Every claim and rescue raises the fence, so an equal fence is this hold's.
-async fn already(tx: &mut Tx<'_>, claim: &Claim) -> sqlx::Result<Option<JobState>> {
+async fn already(tx: &mut Tx<'_>, end: &End) -> sqlx::Result<Option<JobState>> {
     let ended = "SELECT state FROM job WHERE id = $1 AND fence = $2";
-    let row = tx.row(ended, args![&claim.id, claim.fence]).await?;
+    let row = tx.row(ended, args![&end.id, end.fence]).await?;
     row.map(|row| JobState::of(row.get("state")?)).transpose()
 }
 
@@ -138,10 +196,29 @@ fn result_json(closing: &Closing) -> Option<String> {
     Some(serde_json::json!({"digest": result.digest, "bytes": result.bytes}).to_string())
 }
 
-async fn name_artefact(tx: &mut Tx<'_>, job: &str, artefact: &ArtefactRow) -> sqlx::Result<()> {
-    let sql = "INSERT INTO artefact (job, name, media_type, bytes, digest, object_key) VALUES ($1, $2, $3, $4, $5, $6)";
-    let values =
-        args![job, &artefact.name, &artefact.media_type, artefact.bytes, &artefact.digest, &artefact.object_key];
-    tx.run(sql, values).await?;
+static NAMES: Sizes = Sizes::new(|artefacts| {
+    let values = placeholders(artefacts, 6);
+    format!(
+        "WITH named (a_job, a_name, a_media, a_bytes, a_digest, a_key, a_row) AS (VALUES {values}) \
+         INSERT INTO artefact (job, name, media_type, bytes, digest, object_key) \
+         SELECT a_job, a_name, a_media, a_bytes, a_digest, a_key FROM named WHERE a_row = 1"
+    )
+});
+
+async fn name_artefacts<'e>(tx: &mut Tx<'_>, ends: impl Iterator<Item = &'e End>) -> sqlx::Result<()> {
+    let of = |job: &str, a: &ArtefactRow| {
+        [
+            Value::from(job),
+            Value::from(&a.name),
+            Value::from(&a.media_type),
+            Value::from(a.bytes),
+            Value::from(&a.digest),
+            Value::from(&a.object_key),
+        ]
+    };
+    let named: Vec<_> = ends.flat_map(|end| end.artefacts.iter().map(move |a| of(&end.id, a))).collect();
+    for (sql, values) in NAMES.over(&named) {
+        tx.run(sql, values).await?;
+    }
     Ok(())
 }

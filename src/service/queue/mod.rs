@@ -4,7 +4,7 @@
 //! later write of the worker carries `id`, `fence` and `state = 'running'`, and no row touched means that the lease
 //! was lost: the worker stops and drops its files. Each change and its event commit together, so a reader who has
 //! seen event N has seen everything before it; triggers on the row see to that, and to what follows an end (retention,
-//! webhooks: migrations 0007, docs/adr/0075). Rejected: the queue library apalis 1.0, which started a poison job of
+//! webhooks: migrations 0007 and 0008, docs/adr/0075). Rejected: the queue library apalis 1.0, which started a poison job of
 //! two attempts five times and drained 38-68 times slower at 8,000 queued jobs.
 //!
 //! `submit`, `several`, `gather`, `read` and `results` serve the API, `claim` and `finish` the workers, `keep` retention and the workers' roll.
@@ -29,7 +29,9 @@ pub use several::{MOST_TOGETHER, Together as Several};
 pub use submit::{NewJob, Submitted};
 pub use types::{ArtefactRow, EventRow, JobRow, JobState};
 
-use crate::db::{Db, Together};
+use crate::db::{Db, Grouped, Together};
+use claim::Wanted;
+use finish::End;
 use std::sync::Arc;
 use tokio::sync::{broadcast, mpsc};
 use tokio_util::sync::CancellationToken;
@@ -42,6 +44,9 @@ pub const LEASE_MS: i64 = 10_000;
 pub const AGEING_MS: i64 = 60_000;
 /// Job ids buffered for a slow listener; one that lags reads the table anyway.
 const HINTS: usize = 1024;
+/// Groups of submissions at the same time: those of several tenants. Of claims and of ends there is one group: two of claims would want
+/// the same jobs, and both fall apart into single calls where more are under way.
+const SUBMISSIONS: usize = 4;
 /// Hints to other processes go out together, this often at most.
 const TELL: std::time::Duration = std::time::Duration::from_millis(10);
 /// Between attempts to listen again.
@@ -55,19 +60,27 @@ pub struct Queue {
     told: broadcast::Sender<Uuid>,
     /// Callers that ask for single jobs at the same time, by tenant and id.
     asked: Arc<Together<(String, String), JobRow>>,
+    /// Callers that submit, claim and end jobs at the same time.
+    news: Arc<Grouped<NewJob, Option<JobRow>>>,
+    claims: Arc<Grouped<Wanted, Option<Claim>>>,
+    ends: Arc<Grouped<End, Option<JobState>>>,
 }
 
 impl Queue {
     /// A queue over an open database.
     pub fn new(db: Db) -> Self {
-        let asked = Arc::default();
-        Self { db, hints: broadcast::Sender::new(HINTS), told: broadcast::Sender::new(HINTS), asked }
+        Self::over(db, broadcast::Sender::new(HINTS), broadcast::Sender::new(HINTS))
     }
 
     /// The same table and hints through another connection (the heartbeat thread has its own).
     #[must_use]
     pub fn with_db(&self, db: Db) -> Self {
-        Self { db, hints: self.hints.clone(), told: self.told.clone(), asked: Arc::default() }
+        Self::over(db, self.hints.clone(), self.told.clone())
+    }
+
+    fn over(db: Db, hints: broadcast::Sender<Uuid>, told: broadcast::Sender<Uuid>) -> Self {
+        let (news, claims, ends) = (Grouped::new(SUBMISSIONS), Grouped::new(1), Grouped::new(1));
+        Self { db, hints, told, asked: Arc::default(), news: news.into(), claims: claims.into(), ends: ends.into() }
     }
 
     /// The database under it.

@@ -29,7 +29,7 @@ impl Queue {
     pub async fn submit_together(&self, jobs: &[NewJob]) -> sqlx::Result<Together> {
         let submitted = match self.together_once(jobs).await {
             // Another request with the same key was faster: now its jobs are there to be found.
-            Err(sqlx::Error::Database(fault)) if fault.is_unique_violation() => self.together_once(jobs).await?,
+            Err(sqlx::Error::RowNotFound) => self.together_once(jobs).await?,
             other => other?,
         };
         if matches!(submitted, Together::New(_)) {

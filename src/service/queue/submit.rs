@@ -1,7 +1,8 @@
 //! Accepting, cancelling, retrying and erasing: the writes of the API.
 
 use super::{AGEING_MS, JobRow, JobState, Queue};
-use crate::db::{Scope, Tx, args};
+use crate::db::{Db, Scope, Sizes, Tx, Value, args, placeholders};
+use std::collections::BTreeMap;
 use uuid::Uuid;
 
 /// Jobs that one bulk cancel takes in one transaction; the rest follows in the next.
@@ -60,15 +61,28 @@ impl Queue {
     /// # Errors
     /// The database's.
     pub async fn submit(&self, job: &NewJob) -> sqlx::Result<Submitted> {
-        let submitted = match self.submit_once(job).await {
-            // Another request with the same key was faster: now its job is there to be found.
-            Err(sqlx::Error::Database(fault)) if fault.is_unique_violation() => self.submit_once(job).await?,
-            other => other?,
+        let db = self.db().clone();
+        let write = move |jobs: Vec<NewJob>| {
+            let db = db.clone();
+            async move { new(&db, jobs).await }
+        };
+        let submitted = match self.news.call(job.clone(), |a, b| a.tenant == b.tenant, write).await? {
+            Some(row) => Submitted::New(row.into()),
+            None => self.submit_keyed(job).await?,
         };
         if matches!(submitted, Submitted::New(_)) {
             self.hint(job.id);
         }
         Ok(submitted)
+    }
+
+    /// Accepts a job whose key another one has, or had until a moment ago.
+    async fn submit_keyed(&self, job: &NewJob) -> sqlx::Result<Submitted> {
+        match self.submit_once(job).await {
+            // Another request with the same key was faster: now its job is there to be found.
+            Err(sqlx::Error::RowNotFound) => self.submit_once(job).await,
+            other => other,
+        }
     }
 
     async fn submit_once(&self, job: &NewJob) -> sqlx::Result<Submitted> {
@@ -203,28 +217,66 @@ pub(super) async fn accepted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<Subm
     Ok(Submitted::New(inserted(tx, job).await?.into()))
 }
 
+/// Jobs of one tenant that are new, in their order; `None` for one whose idempotency key was used before.
+async fn new(db: &Db, jobs: Vec<NewJob>) -> sqlx::Result<Vec<Option<JobRow>>> {
+    let Some(tenant) = jobs.first().map(|job| job.tenant.clone()) else { return Ok(Vec::new()) };
+    let work = db.write(Scope::Tenant(&tenant), move |tx| {
+        Box::pin(async move {
+            let mut rows = insert(tx, &jobs).await?;
+            Ok(jobs.iter().map(|job| rows.remove(&job.id.to_string())).collect())
+        })
+    });
+    work.await
+}
+
+/// The row of a new job. Whoever calls has looked for its idempotency key: one that is there by now is
+/// [`sqlx::Error::RowNotFound`], at which the request begins again.
 pub(super) async fn inserted(tx: &mut Tx<'_>, job: &NewJob) -> sqlx::Result<JobRow> {
-    let insert = "INSERT INTO job (id, tenant, kind, state, priority, plan, input_digest, input_files, input_bytes, \
-        memory_mb, trace_id, idempotency_key, rank, run_at, created_at, parent) \
-        VALUES ($1, $2, $12, 'queued', $3, $4, $5, $6, $7, $8, $9, $10, now_ms() - $11, now_ms(), now_ms(), $13) \
-        RETURNING *";
-    let values = args![
-        job.id,
-        &job.tenant,
-        job.priority,
-        &job.plan,
-        &job.input_digest,
-        job.input_files,
-        job.input_bytes,
-        job.memory_mb,
-        &job.trace_id,
-        &job.idempotency_key,
-        job.priority.saturating_mul(AGEING_MS),
-        if is_variant(&job.plan) { "variant" } else { "reconstruction" },
-        job.parent.map(|id| id.to_string()),
-    ];
-    let row = tx.row(insert, values).await?.ok_or(sqlx::Error::RowNotFound)?;
-    JobRow::of(&row)
+    insert(tx, std::slice::from_ref(job)).await?.remove(&job.id.to_string()).ok_or(sqlx::Error::RowNotFound)
+}
+
+const COLUMNS: usize = 13;
+static INSERT: Sizes = Sizes::new(|jobs| {
+    let values = placeholders(jobs, COLUMNS);
+    format!(
+        "WITH new (n_id, n_tenant, n_kind, n_priority, n_plan, n_digest, n_files, n_bytes, n_memory, n_trace, n_key, n_ahead, \
+         n_parent, n_row) AS (VALUES {values}) \
+         INSERT INTO job (id, tenant, kind, state, priority, plan, input_digest, input_files, input_bytes, memory_mb, trace_id, \
+         idempotency_key, rank, run_at, created_at, parent) \
+         SELECT n_id, n_tenant, n_kind, 'queued', n_priority, n_plan, n_digest, n_files, n_bytes, n_memory, n_trace, n_key, \
+         now_ms() - n_ahead, now_ms(), now_ms(), n_parent FROM new WHERE n_row = 1 \
+         ON CONFLICT (tenant, idempotency_key) WHERE idempotency_key IS NOT NULL DO NOTHING RETURNING *"
+    )
+});
+
+/// Inserts jobs but those whose idempotency key is there already; the new ones by their ids.
+async fn insert(tx: &mut Tx<'_>, jobs: &[NewJob]) -> sqlx::Result<BTreeMap<String, JobRow>> {
+    let mut rows = BTreeMap::new();
+    for (sql, values) in INSERT.over(&jobs.iter().map(values).collect::<Vec<_>>()) {
+        for row in tx.rows(sql, values).await? {
+            let row = JobRow::of(&row)?;
+            rows.insert(row.id.clone(), row);
+        }
+    }
+    Ok(rows)
+}
+
+fn values(job: &NewJob) -> [Value; COLUMNS] {
+    [
+        Value::from(job.id),
+        Value::from(&job.tenant),
+        Value::from(if is_variant(&job.plan) { "variant" } else { "reconstruction" }),
+        Value::from(job.priority),
+        Value::from(&job.plan),
+        Value::from(&job.input_digest),
+        Value::from(job.input_files),
+        Value::from(job.input_bytes),
+        Value::from(job.memory_mb),
+        Value::from(&job.trace_id),
+        Value::from(&job.idempotency_key),
+        Value::from(job.priority.saturating_mul(AGEING_MS)),
+        Value::from(job.parent.map(|id| id.to_string())),
+    ]
 }
 
 /// Whether a plan asks for a re-synthesis in place of a scan's reconstruction.

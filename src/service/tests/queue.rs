@@ -2,58 +2,17 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+#[macro_use]
 mod support;
 
 use service::auth::tenants;
 use service::db::{Db, Scope};
-use service::queue::{
-    ArtefactRow, Beat, Claim, Closing, Finished, JobState, NewJob, Page, Published, Queue, Room, Several, Submitted,
-    Verdict,
-};
+use service::queue::{Beat, Closing, Finished, JobState, NewJob, Page, Queue, Room, Several, Submitted, Verdict};
 use service::{Config, Problem};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
+use support::queues::{Bench, add, claim, new, sql, state, success};
 use uuid::Uuid;
-
-/// A queue on a database of its own.
-struct Bench {
-    queue: Queue,
-    config: Config,
-    _folder: tempfile::TempDir,
-}
-
-async fn sqlite() -> Option<Bench> {
-    let folder = tempfile::TempDir::new().unwrap();
-    let config = support::config(folder.path());
-    std::fs::create_dir_all(&config.data_dir).unwrap();
-    Some(Bench { queue: Queue::new(Db::open(&config).await.unwrap()), config, _folder: folder })
-}
-
-async fn postgres() -> Option<Bench> {
-    let cluster = tokio::task::spawn_blocking(support::postgres::cluster).await.unwrap()?;
-    let folder = tempfile::TempDir::new().unwrap();
-    let config = Config { database_url: Some(cluster.database()), ..support::config(folder.path()) };
-    Some(Bench { queue: Queue::new(Db::open(&config).await.unwrap()), config, _folder: folder })
-}
-
-macro_rules! on_both {
-    ($($name:ident)*) => {
-        mod on_sqlite {
-            $(#[tokio::test(flavor = "multi_thread")]
-            async fn $name() {
-                super::$name(super::sqlite().await.unwrap()).await;
-            })*
-        }
-        mod on_postgres {
-            $(#[tokio::test(flavor = "multi_thread")]
-            async fn $name() {
-                if let Some(bench) = super::postgres().await {
-                    super::$name(bench).await;
-                }
-            })*
-        }
-    };
-}
 
 on_both! {
     a_job_goes_from_queue_to_success
@@ -80,52 +39,6 @@ on_both! {
     a_backup_holds_every_job
     hints_travel_or_are_not_needed
     the_order_of_claims_does_not_slow_with_the_backlog
-}
-
-fn new(tenant: &str) -> NewJob {
-    NewJob {
-        id: Uuid::now_v7(),
-        tenant: tenant.to_owned(),
-        priority: 0,
-        plan: "{}".to_owned(),
-        input_digest: "sha256:0".to_owned(),
-        input_files: 1,
-        input_bytes: 1,
-        memory_mb: 0,
-        trace_id: "t".to_owned(),
-        idempotency_key: None,
-        parent: None,
-    }
-}
-
-async fn add(queue: &Queue, change: impl FnOnce(&mut NewJob)) -> Uuid {
-    let mut job = new("default");
-    change(&mut job);
-    assert!(matches!(queue.submit(&job).await.unwrap(), Submitted::New(_)));
-    job.id
-}
-
-async fn claim(queue: &Queue) -> Option<Claim> {
-    queue.claim("w", Room::Any).await.unwrap()
-}
-
-fn success() -> Closing {
-    let artefact = |name: &str| ArtefactRow {
-        name: name.to_owned(),
-        media_type: "application/json".to_owned(),
-        bytes: 2,
-        digest: "sha256:1".to_owned(),
-        object_key: format!("k/{name}"),
-    };
-    Closing::Succeeded(Published { artefacts: vec![artefact("result.json"), artefact("a.csv")] })
-}
-
-async fn sql(queue: &Queue, sql: &'static str) {
-    queue.db().run(Scope::System, sql, Vec::new()).await.unwrap();
-}
-
-async fn state(queue: &Queue, id: Uuid) -> JobState {
-    queue.job("default", id).await.unwrap().unwrap().state
 }
 
 async fn a_job_goes_from_queue_to_success(b: Bench) {
@@ -547,7 +460,7 @@ async fn a_newer_schema_is_refused(b: Bench) {
 
 async fn a_backup_holds_every_job(b: Bench) {
     let id = add(&b.queue, |_| {}).await;
-    let file = b._folder.path().join("copy.sqlite");
+    let file = b.folder.path().join("copy.sqlite");
     let copied = b.queue.db().backup(&file).await;
     if b.config.database_url.is_some() {
         assert!(copied.unwrap_err().to_string().contains("pg_dump"));
