@@ -5,6 +5,7 @@
 //! that `POST /v1/session` sets; a changing call by cookie must come from the same origin. Whatever else comes as a bearer
 //! is a token of the configured identity provider ([`oidc`]), or nothing.
 
+mod callers;
 mod jwks;
 pub mod keys;
 pub mod links;
@@ -12,10 +13,11 @@ mod oidc;
 mod pace;
 pub mod tenants;
 
+pub(crate) use callers::Callers;
 pub use oidc::Provider;
 
 use crate::config::Auth;
-use crate::db::{Db, MOST, Scope, Together, Value, args};
+use crate::db::{Db, Scope, args};
 use crate::error::Problem;
 use crate::state::State;
 use crate::store::hex;
@@ -23,7 +25,6 @@ use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode, header};
 use sha2::{Digest as _, Sha256};
-use std::collections::BTreeMap;
 use uuid::Uuid;
 
 /// Begins every API key.
@@ -126,22 +127,9 @@ fn digest(key: &str) -> Vec<u8> {
     Sha256::digest(key.as_bytes()).to_vec()
 }
 
-/// A key's row.
-#[derive(Clone, Debug)]
-pub(crate) struct Found {
-    id: String,
-    tenant: String,
-    role: String,
-    max_bytes: Option<i64>,
-    requests_per_minute: Option<i64>,
-}
-
-/// Callers whose keys are looked up at the same time, by digest.
-pub(crate) type Callers = Together<Vec<u8>, Found>;
-
 /// The principal of a key, or a 401.
 async fn principal(state: &State, key: &str) -> Result<Principal, Problem> {
-    let found = state.callers.row(digest(key), |_, _| true, |digests| found(state.queue.db(), digests)).await?;
+    let found = state.callers.found(state.queue.db(), digest(key)).await?;
     let Some(found) = found else {
         return Err(unauthorized("auth.key", "This API key is unknown or revoked. Ask the operator for a new one."));
     };
@@ -151,29 +139,6 @@ async fn principal(state: &State, key: &str) -> Result<Principal, Problem> {
     }
     let max_bytes = found.max_bytes.and_then(|n| u64::try_from(n).ok());
     Ok(Principal { tenant: found.tenant, role, actor: found.id, max_bytes })
-}
-
-const KEYS: &str = "SELECT id, tenant, role, max_bytes, requests_per_minute, digest FROM api_key \
-    WHERE revoked_at IS NULL AND digest IN ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16, $17, \
-    $18, $19, $20, $21, $22, $23, $24, $25, $26, $27, $28, $29, $30, $31, $32)";
-
-/// Keys that count, by digest.
-async fn found(db: &Db, digests: Vec<Vec<u8>>) -> sqlx::Result<BTreeMap<Vec<u8>, Found>> {
-    let Some(last) = digests.last().cloned() else { return Ok(BTreeMap::new()) };
-    let mut values: Vec<Value> = digests.into_iter().map(Value::from).collect();
-    values.resize(MOST, Value::from(last));
-    let rows = db.rows(Scope::System, KEYS, values).await?;
-    let read = |row: &crate::db::Row| {
-        let found = Found {
-            id: row.get("id")?,
-            tenant: row.get("tenant")?,
-            role: row.get("role")?,
-            max_bytes: row.get("max_bytes")?,
-            requests_per_minute: row.get("requests_per_minute")?,
-        };
-        Ok((row.get("digest")?, found))
-    };
-    rows.iter().map(read).collect()
 }
 
 /// The caller of an API key or of a token.

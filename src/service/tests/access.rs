@@ -6,6 +6,7 @@ mod support;
 
 use reqwest::{Method, StatusCode};
 use serde_json::json;
+use service::auth::keys;
 use service::{Auth, Server};
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -31,6 +32,30 @@ async fn an_open_address_without_keys_is_refused_at_start() {
     config.listen = "0.0.0.0:0".parse().unwrap();
     let refused = Server::start(config).await.unwrap_err();
     assert!(refused.to_string().contains("without keys"), "{refused}");
+}
+
+/// As `vasculum key revoke` beside the server does it: from another connection, by commits that the server does not see made.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_key_revoked_by_another_process_stops_at_once() {
+    let service = Service::with(|config| config.auth = Auth::Required).await;
+    let first = service.server.as_ref().unwrap().first_key().unwrap().to_owned();
+    let mut config = support::config(service.folder.path());
+    config.auth = Auth::Required;
+    let beside = service::db::Db::open(&config).await.unwrap();
+    let status =
+        async |key: &str| service.request(Method::GET, "/v1/jobs").bearer_auth(key).send().await.unwrap().status();
+    for round in 0..5 {
+        let key = keys::create(&beside, keys::NewKey::default()).await.unwrap();
+        for _ in 0..3 {
+            assert_eq!(status(&key).await, StatusCode::OK, "round {round}");
+        }
+        let made = keys::list(&beside).await.unwrap().pop().unwrap();
+        assert!(keys::revoke(&beside, &made.id).await.unwrap());
+        assert_eq!(status(&key).await, StatusCode::UNAUTHORIZED, "round {round}");
+        assert_eq!(status(&first).await, StatusCode::OK, "another key stays");
+    }
+    beside.close().await;
+    service.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
