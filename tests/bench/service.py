@@ -1,6 +1,6 @@
 """`cargo xtask bench service`: GET of a job by wrk, with and without a key, and the memory of 50 uploads at the same time.
 
-Arguments: seconds of each run of wrk, MB of each upload. Rates are shown beside the server's own processor time, which a busy machine
+Arguments: seconds of each run of wrk, MB of each upload (fewer where the disk has no room for all of them). Rates are shown beside the server's own processor time, which a busy machine
 changes less.
 """
 
@@ -8,6 +8,7 @@ import http.client
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -17,7 +18,8 @@ import time
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "python"))
 from support import Service  # noqa: E402
 
-SECONDS, MEGABYTES, AT_ONCE = int(sys.argv[1]), int(sys.argv[2]), 50
+SECONDS, AT_ONCE = int(sys.argv[1]), 50
+MEGABYTES = min(int(sys.argv[2]), int(0.8 * shutil.disk_usage(tempfile.gettempdir()).free / AT_ONCE) >> 20)
 
 
 def processor(pid):

@@ -20,9 +20,9 @@ pub(crate) enum What {
     Surface,
     /// Angles, areas, radii and centrelines beside VMTK's on the same scans, with both chains' times stage by stage.
     Accuracy,
-    /// GET of a job by wrk, and the memory of 50 uploads of 120 MB at the same time.
+    /// GET of a job by wrk, and the memory of 50 uploads at the same time.
     Service,
-    /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued.
+    /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued, and beside a queue library.
     Queue,
 }
 
@@ -67,7 +67,7 @@ pub(crate) fn accuracy(seeds: usize) -> Result<()> {
 pub(crate) fn service(binary: &Path) -> Result<()> {
     tools::wrk()?;
     let mut bench = shell::command(tools::python()?);
-    bench.arg(shell::root()?.join("tests/bench/service.py")).args(["10", "120"]);
+    bench.arg(shell::root()?.join("tests/bench/service.py")).args(["10", "500"]);
     bench.env("VASCULUM_ROOT", shell::root()?).env("VASCULUM_BIN", binary);
     shell::run(bench)
 }
@@ -129,7 +129,7 @@ fn show(runs: &[Value]) -> Result<()> {
     Ok(())
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
 }

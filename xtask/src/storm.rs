@@ -1,6 +1,6 @@
 //! `cargo xtask storm` and `cargo xtask bench queue`: the queue under `kill -9`, and its speed.
 
-use crate::{shell, tools};
+use crate::{bench, shell, tools};
 use anyhow::{Result, anyhow};
 use std::path::Path;
 use std::process::Command;
@@ -27,9 +27,35 @@ pub(crate) fn short(program: &Path) -> Result<()> {
     })
 }
 
-/// The queue's speed on both databases.
+/// Jobs queued in the comparison with a queue library.
+const QUEUED: &str = "8000";
+
+/// Drains of each side of the comparison; the medians are compared.
+const DRAINS: usize = 3;
+
+/// The queue's speed on both databases, and beside a library's on SQLite.
 pub(crate) fn bench(large: u64) -> Result<()> {
-    each(&tools::release_example("queue_bench")?, &["--large", &large.to_string()], false)
+    let ours = tools::release_example("queue_bench")?;
+    each(&ours, &["--large", &large.to_string()], false)?;
+    let built = tools::target()?.join("bench-queue");
+    let mut build = shell::command("cargo");
+    build.args(["build", "--release", "--quiet", "--manifest-path"]);
+    build.arg(shell::root()?.join("tests/bench/queue/Cargo.toml")).env("CARGO_TARGET_DIR", &built);
+    shell::run(build)?;
+    let (mut we, mut they) = (Vec::new(), Vec::new());
+    for _ in 0..DRAINS {
+        we.push(drained(command(&ours, "sqlite", &["--drain", QUEUED], false))?);
+        let mut peer = shell::command(built.join("release/bench-queue-peer"));
+        peer.arg(QUEUED);
+        they.push(drained(peer)?);
+    }
+    let (we, they) = (bench::median(we), bench::median(they));
+    println!("{QUEUED} queued no-op jobs on SQLite: {we:.0}/s, apalis 1.0 {they:.0}/s ({:.1} times)", we / they);
+    Ok(())
+}
+
+fn drained(run: Command) -> Result<f64> {
+    Ok(shell::output(run)?.trim().parse()?)
 }
 
 fn each(program: &Path, arguments: &[&str], is_storm: bool) -> Result<()> {
