@@ -151,7 +151,7 @@ impl Planes {
                     .push(oblique(cap.centroid, "no whole section lies between the data's end and a junction"));
                 continue;
             };
-            if let Err(unfit) = self.found.cut((own, side), way.from_tip(back), field, pixel_mm) {
+            if let Err(unfit) = self.found.cut((own, side), way.way_at(back), field, pixel_mm) {
                 self.warnings.push(oblique(cap.centroid, unfit.reason()));
                 continue;
             }
@@ -211,13 +211,13 @@ struct Way<'a> {
 
 impl Way<'_> {
     /// Arc length from the line's first point, that from its tip given.
-    fn from_tip(&self, back: f64) -> f64 {
+    fn way_at(&self, back: f64) -> f64 {
         if self.side == 1 { self.graph.edges[self.own].length_mm() - back } else { back }
     }
 
     /// Direction out of the lumen, and inscribed radius.
     fn outward(&self, back: f64) -> Option<(V3, f64)> {
-        let (tangent, radius) = line(&self.graph.edges[self.own], self.from_tip(back))?;
+        let (tangent, radius) = line(&self.graph.edges[self.own], self.way_at(back))?;
         Some((if self.side == 1 { tangent } else { -tangent }, radius))
     }
 
@@ -242,7 +242,7 @@ impl Way<'_> {
         let inside = |p: P3| planes.iter().all(|c| c.height(p) < -MARGIN_PX * pixel_mm);
         let whole = |&back: &f64| {
             let Some((tangent, radius)) = self.outward(back) else { return false };
-            let at = along(edge, self.from_tip(back));
+            let at = along(edge, self.way_at(back));
             let limit = WIDE * radius;
             inside(at) && outline(field, at, tangent, limit).all(|p| inside(p) && p.distance(at) < limit)
         };
