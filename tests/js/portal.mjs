@@ -141,7 +141,10 @@ async function sendThroughTrouble() {
   await accessible("a new key");
   await page.getByRole("button", { name: "Close" }).click();
   await accessible("the administration");
-  await page.getByText("made a key").first().waitFor();
+  await page.locator(".audit tbody").getByText("made a key").first().waitFor();
+  await page.getByLabel("What", { exact: true }).selectOption({ label: "made a key" });
+  await until("an audit of one kind", async () => (await page.locator(".audit tbody tr").evaluateAll((rows) => rows.every((row) => row.cells[2].innerText === "made a key"))));
+  await page.getByLabel("What", { exact: true }).selectOption("");
   await shot("admin");
   refusals = [401, "broken"];
   await page.getByRole("button", { name: "Sign out" }).click();
@@ -176,6 +179,19 @@ async function checkAndReconstruct(truth) {
   await page.getByLabel("Seed point").check();
   await page.locator(".check-picture .overlay").click({ position: { x: 90, y: 90 } });
   await page.getByText("1 seed point").waitFor();
+  await page.getByText("Priority and plan").click();
+  const written = () => page.getByLabel("Plan (JSON)").inputValue().then(JSON.parse);
+  assert.equal((await written()).segmentation.seeds_mm.length, 1, "what is placed stands in the plan's text");
+  await page.getByLabel("Circle").check();
+  const picture = await page.locator(".check-picture .overlay").boundingBox();
+  await page.mouse.move(picture.x + 120, picture.y + 120);
+  await page.mouse.down();
+  await page.mouse.move(picture.x + 160, picture.y + 120);
+  await page.mouse.up();
+  await page.getByText(/circle on slice/).waitFor();
+  const drawn = (await written()).segmentation.region;
+  const wanted = (40 / picture.width) * Number(/(\d+) × \d+ × \d+/.exec(await facts.innerText())[1]);
+  assert.ok(Math.abs(drawn.radius_px - wanted) < 0.02 * wanted, `a circle of ${drawn.radius_px} pixels, drawn as ${wanted}`);
   await page.getByRole("button", { name: "Take all away" }).click();
   await page.getByText("Nothing is placed").waitFor({ timeout: LONG, state: "attached" });
   await accessible("a checked scan");
@@ -235,11 +251,24 @@ async function coupled() {
   await page.keyboard.press("End");
   await page.waitForTimeout(200);
   assert.notEqual(await told.innerText(), second, "the cursor along a branch goes to its slice");
-  await page.locator(".scene-tools select").selectOption("displacement");
+  await walls(canvas);
   await page.getByLabel("Cut at the slice").check();
   await page.locator(".ramp").waitFor();
   await page.waitForTimeout(600);
   await shot("result");
+}
+
+// Every way to colour the wall shows another picture, and a legend that says what the colours are.
+async function walls(canvas) {
+  const seen = new Set();
+  const ways = { clear: null, solid: null, none: null, quality: /smallest angle.*30°.*60°/s, patches: /distal.*proximal.*graft/s, displacement: /≥ 0\.\d+ mm.*outward/s };
+  for (const [way, legend] of Object.entries(ways)) {
+    await page.locator(".scene-tools select").selectOption(way);
+    await until(`the legend of ${way}`, async () => (legend ? legend.test(await page.locator(".ramp").innerText()) : !(await page.locator(".ramp").isVisible())));
+    await page.waitForTimeout(600);
+    seen.add((await canvas.screenshot()).toString("base64"));
+  }
+  assert.equal(seen.size, Object.keys(ways).length, "each way to show the wall is another picture");
 }
 
 async function correctRoles(id, truth) {
@@ -337,7 +366,22 @@ async function queue() {
   await page.getByLabel("State").selectOption("");
   await page.getByRole("button", { name: "Size" }).click();
   await page.locator('th[aria-sort="descending"]', { hasText: "Size" }).waitFor();
+  await warned(first.id);
   assert.equal((await api(`/v1/jobs/${first.id}`, { method: "DELETE" })).status, 204);
+}
+
+// A warning's place is gone to by a press: roles by rule speak of the junction.
+async function warned(id) {
+  await until("a job with warnings", async () => (await read(`/v1/jobs/${id}`)).state === "succeeded");
+  await open(`#/jobs/${id}`, ".slice-tools output");
+  const told = page.locator(".slice-tools output");
+  const { position } = (await read(`/v1/jobs/${id}/result`)).warnings.find((w) => w.code === "roles.by_rule").where;
+  await page.locator(".slice-tools input").fill("3");
+  const far = await told.innerText();
+  await page.locator(".warning li", { hasText: "roles.by_rule" }).getByRole("button", { name: /^Show/ }).click();
+  assert.notEqual(await told.innerText(), far, "the slice is another one");
+  const z = Number(/z = (-?[\d.]+) mm/.exec(await told.innerText())[1]);
+  assert.ok(Math.abs(z - position[2]) <= 0.76, `slice at ${z}, the warning at ${position[2]}`);
 }
 
 async function mendFailed() {

@@ -5,6 +5,8 @@ import { whoami } from "./session.js";
 import { bytes, has, t, when } from "./text.js";
 
 const ROLES = ["upload", "read", "auditor", "admin"];
+// Lines of the audit that are shown at once.
+const SHOWN = 200;
 
 export async function showAdmin(box, { signal }) {
   const who = await whoami();
@@ -92,27 +94,40 @@ async function workersCard(signal) {
 
 async function drawAudit(box, signal) {
   const lines = h("tbody");
-  const state = { next: "/v1/audit", items: [] };
+  const state = { next: "/v1/audit", events: [], action: "" };
   const search = h("input", { type: "search", oninput: () => draw() });
-  const draw = () => {
-    const text = search.value.trim().toLowerCase();
-    const rows = state.items.filter((line) => line.join(" ").toLowerCase().includes(text)).slice(0, 200);
-    lines.replaceChildren(...rows.map((line) => h("tr", {}, line.map((cell) => h("td", {}, cell)))));
-  };
+  const names = await keyNames(signal);
   // Oldest first by the service; the newest matter most here.
   for (let page = 0; state.next && page < 20; page += 1) {
     const list = await json(state.next, { signal });
-    state.items.unshift(...list.items.map(readEvent).reverse());
+    state.events.unshift(...list.items.map((event) => readEvent(event, names)).reverse());
     state.next = list.next;
   }
+  const actions = [...new Set(state.events.map((e) => e.action))].sort();
+  const action = select([["", t("queue.all")], ...actions.map((a) => [a, actionName(a)])], "", (value) => { state.action = value; draw(); });
+  const draw = () => {
+    const text = search.value.trim().toLowerCase();
+    const rows = state.events.filter((e) => (!state.action || e.action === state.action) && e.cells.join(" ").toLowerCase().includes(text)).slice(0, SHOWN);
+    lines.replaceChildren(...rows.map((e) => h("tr", {}, e.cells.map((cell) => h("td", {}, cell)))));
+  };
   draw();
   const columns = ["when", "who", "what", "object"].map((k) => h("th", { scope: "col" }, t(`audit.${k}`)));
-  box.replaceChildren(card(t("audit.title"), h("div", { class: "filters" }, field(t("queue.search"), search)),
+  box.replaceChildren(card(t("audit.title"), h("div", { class: "filters" }, field(t("queue.search"), search), field(t("audit.what"), action)),
     h("div", { class: "scroll tall", tabindex: "0", role: "region", "aria-label": t("audit.title") }, h("table", { class: "audit" }, h("caption", { class: "unseen" }, t("audit.title")), h("thead", {}, h("tr", {}, columns)), lines)),
-    h("p", { class: "soft note" }, t("audit.note"))));
+    h("p", { class: "soft note" }, t("audit.note"), " ", h("code", {}, "vasculum verify-audit"))));
 }
 
-function readEvent(event) {
+// What keys are for, by id; an auditor reads ids.
+async function keyNames(signal) {
+  if ((await whoami()).role !== "admin") return {};
+  const { items } = await json("/v1/keys", { signal });
+  return Object.fromEntries(items.map((key) => [key.id, key.label]));
+}
+
+const actionName = (action) => (has(`audit.${action}`) ? t(`audit.${action}`) : action);
+
+function readEvent(event, names) {
   const action = event.subtype?.[0]?.code ?? "";
-  return [when(event.recorded), event.agent?.[0]?.who?.identifier?.value ?? "", has(`audit.${action}`) ? t(`audit.${action}`) : action, event.entity?.[0]?.what?.identifier?.value ?? ""];
+  const who = event.agent?.[0]?.who?.identifier?.value ?? "";
+  return { action, cells: [when(event.recorded, "medium", "medium"), names[who] ? `${names[who]} (${who.slice(-8)})` : who, actionName(action), event.entity?.[0]?.what?.identifier?.value ?? ""] };
 }

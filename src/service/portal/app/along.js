@@ -1,5 +1,5 @@
 // Area, radius and curvature along the branches, with a cursor that is the same point in 3D and on the slices.
-import { card, h } from "./dom.js";
+import { card, field, h, select } from "./dom.js";
 import { finite, plot } from "./plot.js";
 import { roleName, t } from "./text.js";
 
@@ -36,6 +36,9 @@ export function curvesOf(branches, quantity, dress = (b) => ({ name: roleName(b)
 
 export { QUANTITIES };
 
+// With more branches than this one is shown at a time: curves of one colour cannot be told apart.
+const TOGETHER = 5;
+
 export function along(found, focus) {
   const branches = found.branches.filter((b) => b.samples?.abscissa_mm?.length > 1);
   if (branches.length === 0) return null;
@@ -48,23 +51,33 @@ export function along(found, focus) {
   };
   const draw = () => {
     const q = state.quantity;
-    const figure = plot(curvesOf(branches, q), { x: t("along.distance"), y: t(`along.${q.key}_unit`), title: t("along.title"), zero: q.zero }, { onCursor: move, digits: q.digits });
+    const figure = plot(curvesOf(branches.length > TOGETHER ? [state.branch] : branches, q), { x: t("along.distance"), y: t(`along.${q.key}_unit`), title: t("along.title"), zero: q.zero }, { onCursor: move, digits: q.digits });
     box.replaceChildren(...(figure?.elements ?? [h("p", { class: "empty" }, t("along.none"))]));
     state.mark = figure?.mark ?? (() => {});
+  };
+  const follow = (id) => {
+    state.branch = branches.find((b) => String(b.id) === String(id));
+    if (branches.length > TOGETHER) draw();
   };
   // A point of the slices or the surface is the nearest sample of all branches.
   focus.join(part, ({ point }) => {
     if (!point) return;
     const far = (b, i) => Math.hypot(...b.samples.position[i].map((x, k) => x - point[k]));
     const best = branches.flatMap((b) => b.samples.position.map((_, i) => ({ b, i, d: far(b, i) }))).reduce((a, c) => (c.d < a.d ? c : a));
+    if (best.b !== state.branch && branches.length > TOGETHER) {
+      follow(best.b.id);
+      list.value = String(best.b.id);
+    }
     state.mark(best.b.samples.abscissa_mm[best.i]);
   });
   const choose = (name, items, pick, current) => h("div", { class: "choices", role: "radiogroup", "aria-label": t(`along.${name}`) },
     items.map(([key, text]) => h("label", { class: "choice" }, h("input", { type: "radio", name: `along-${name}`, checked: key === current, onchange: () => pick(key) }), text)));
+  const list = select(branches.map((b) => [String(b.id), roleName(b)]), String(state.branch.id), follow);
+  const cursor = branches.length > TOGETHER ? field(t("branch.branch"), list)
+    : branches.length > 1 ? h("div", { class: "choices" }, h("span", { class: "soft" }, t("along.cursor")), choose("cursor", branches.map((b) => [b.id, roleName(b)]), follow, state.branch.id)) : null;
   draw();
   return card(t("along.title"),
     choose("quantity", QUANTITIES.map((q) => [q.key, t(`along.${q.key}`)]), (key) => { state.quantity = QUANTITIES.find((q) => q.key === key); draw(); }, state.quantity.key),
-    box,
-    choose("cursor", branches.map((b) => [b.id, roleName(b)]), (id) => { state.branch = branches.find((b) => b.id === id); }, state.branch.id),
+    box, cursor,
     h("p", { class: "soft" }, t("along.note")));
 }

@@ -18,13 +18,13 @@ export function angleCard(junction, onShown) {
     on.has(a.name) ? on.delete(a.name) : on.add(a.name);
     onShown([...on]);
   };
-  const rows = list.map((a, i) => [
-    h("label", { class: "choice" },
+  const right = { class: "number" };
+  const rows = list.map((a, i) => h("tr", {},
+    h("td", {}, h("label", { class: "choice" },
       h("input", { type: "checkbox", checked: on.has(a.name), disabled: a.value === null, onchange: () => toggle(a), "aria-label": t("angles.show", { name: angleName(a.name) }) }),
-      h("span", { class: `dot a${i % 6}`, "aria-hidden": "true" }), angleName(a.name)),
-    h("strong", {}, a.value === null ? t("angles.missing") : `${number(a.value)}°`),
-    band(a),
-  ]);
+      h("span", { class: `dot a${i % 6}`, "aria-hidden": "true" }), angleName(a.name))),
+    // The reason is among the warnings.
+    a.value === null ? h("td", { ...right, colspan: 2 }, h("span", { class: "soft missing" }, t("angles.missing"))) : [h("td", right, h("strong", {}, `${number(a.value)}°`)), h("td", right, band(a))]));
   const vmtk = junction.vmtk?.in_plane?.length ? h("p", { class: "soft" }, t("angles.vmtk", { angles: junction.vmtk.in_plane.map((x) => number(x)).map((x) => `${x}°`).join(", ") })) : null;
   return card(t("angles.title"),
     table(t("angles.title"), [{ title: t("angles.angle") }, { title: t("angles.value"), number: true }, { title: t("angles.band"), number: true }], rows, { class: "angles" }),

@@ -18,7 +18,7 @@ export function check(box, transfer, signal) {
     transfer.change({});
     location.hash = `#/jobs/${job.id}`;
   }, { id: `reconstruct-${transfer.number}` });
-  box.replaceChildren(found, plan, h("div", { class: "actions end" }, send));
+  box.replaceChildren(found, h("div", { class: "actions end" }, send));
   panel.send = send;
   look(panel);
 }
@@ -38,20 +38,22 @@ async function look(panel) {
   } catch (error) {
     if (!(error instanceof Fault)) return;
     transfer.understood = null;
-    found.replaceChildren(problemBox(error.problem, t("check.refused")));
+    found.replaceChildren(problemBox(error.problem, t("check.refused")), panel.plan);
     drawPlan(panel, error.problem);
     return;
   }
   const told = answer.understood;
   announce(t("check.done"));
-  if (!told) return found.replaceChildren(h("p", {}, t("check.nothing")));
+  if (!told) return found.replaceChildren(h("p", {}, t("check.nothing")), panel.plan);
   panel.slices = null;
+  panel.refused = told.refusal;
   const refusal = told.refusal && told.refusal.code !== transfer.known ? problemBox(told.refusal, t("check.no_vessel")) : null;
   const warnings = (told.warnings ?? []).map((w) => h("li", {}, h("code", {}, w.code), ` ${w.message}${place(w.where) ? ` (${place(w.where)})` : ""}`));
   const view = h("div", { class: "check-picture" });
+  // Beside the picture, so that a tool and what it is used on are seen together.
   found.replaceChildren(...[refusal, h("div", { class: "check-grid" }, view,
     h("div", {}, h("h3", {}, t("check.title")), facts(told),
-      warnings.length > 0 ? [h("h3", {}, t("check.warnings")), h("ul", { class: "warnings" }, warnings)] : null))].filter(Boolean));
+      warnings.length > 0 ? [h("h3", {}, t("check.warnings")), h("ul", { class: "warnings" }, warnings)] : null, panel.plan))].filter(Boolean));
   if (told.slices) {
     const image = await picture(told.slices.image);
     panel.slices = new Slices(told.slices, image, { plane: panel.plane });
@@ -94,10 +96,11 @@ function drawPlan(panel, problem) {
   const again = () => { panel.plane = slices?.k; look(panel); };
   const wantsGeometry = problem && (GEOMETRY_CODES.includes(problem.code) || (problem.errors ?? []).some((e) => GEOMETRY_CODES.includes(e.code)));
   const pictures = transfer.understood?.input.format === "pictures";
+  const text = more(transfer, again);
   plan.replaceChildren(...[
     wantsGeometry || pictures ? geometryForm(transfer, again, Boolean(wantsGeometry)) : null,
-    slices ? placing(panel, again) : null,
-    more(transfer, again),
+    slices ? placing(panel, again, text.show) : null,
+    text.element,
   ].filter(Boolean));
   panel.send.hidden = Boolean(problem);
 }
@@ -122,7 +125,7 @@ function geometryForm(transfer, again, open) {
 }
 
 // Seeds and the circle, placed on the picture.
-function placing(panel, again) {
+function placing(panel, again, told) {
   const { transfer, slices } = panel;
   const segmentation = () => (transfer.plan.segmentation ??= {});
   const list = h("p", { class: "soft" });
@@ -131,6 +134,7 @@ function placing(panel, again) {
     slices.marks = seeds;
     slices.circle = region ? ringOf(slices, region) : null;
     slices.draw();
+    told();
     list.textContent = [seeds.length > 0 ? t("placing.seeds", { n: seeds.length }) : "", region ? t("placing.region", { slice: region.slice, radius: number(region.radius_px) }) : ""].filter(Boolean).join(" · ") || t("placing.nothing");
   };
   const tools = { look: null, seed: (from, _to, end) => end && (segmentation().seeds_mm = [...(segmentation().seeds_mm ?? []), slices.toPatient(from).map((x) => Number(x.toFixed(2)))], draw()), circle: (from, to) => { segmentation().region = regionOf(slices, from, to); draw(); } };
@@ -138,7 +142,7 @@ function placing(panel, again) {
   const radios = Object.keys(tools).map((name, i) => h("label", { class: "choice" },
     h("input", { type: "radio", name: `tool-${transfer.number}`, value: name, checked: i === 0, onchange: () => choose(name) }), t(`placing.${name}`)));
   draw();
-  return fold(t("placing.title"), Boolean(transfer.plan.segmentation), h("p", { class: "soft" }, t("placing.why")),
+  return fold(t("placing.title"), Boolean(transfer.plan.segmentation ?? panel.refused), h("p", { class: "soft" }, t("placing.why")),
     h("div", { class: "choices", role: "radiogroup", "aria-label": t("placing.title") }, radios), list,
     h("div", { class: "actions" },
       h("button", { type: "button", class: "quiet", onclick: again }, t("check.again")),
@@ -160,9 +164,14 @@ function ringOf(slices, region) {
   return { k, centre: toTile(slices, region.centre_px), radius: (region.radius_px * slices.spacing[0]) / slices.atlas.pixel_mm };
 }
 
+// JSON with a line for each field; lists of numbers stay on one.
+const written = (plan) => JSON.stringify(plan, null, 1).replace(/\[\s+([^[\]{}]*?)\s+\]/g, (_, list) => `[${list.replace(/\s+/g, " ")}]`);
+
 function more(transfer, again) {
   const text = h("textarea", { rows: 6, spellcheck: "false" });
-  text.value = JSON.stringify(transfer.plan, null, 1);
+  // What the forms set is written here at once: it would be lost with the text's own check otherwise.
+  const show = () => { text.value = written(transfer.plan); };
+  show();
   const fault = h("p", { class: "bad", role: "alert" });
   const apply = () => {
     try {
@@ -174,6 +183,7 @@ function more(transfer, again) {
     again();
   };
   const priority = select([["-10", t("priority.low")], ["0", t("priority.usual")], ["10", t("priority.high")]], String(transfer.priority), (value) => { transfer.priority = Number(value); });
-  return fold(t("plan.title"), false, field(t("plan.priority"), priority, t("plan.priority_hint")), field(t("plan.json"), text, t("plan.json_hint")), fault,
+  const element = fold(t("plan.title"), false, field(t("plan.priority"), priority, t("plan.priority_hint")), field(t("plan.json"), text, t("plan.json_hint")), fault,
     h("button", { type: "button", class: "quiet", onclick: apply }, t("check.again")));
+  return { element, show };
 }

@@ -25,8 +25,13 @@ export async function cohort(asked, signal) {
   return [...rows.values()];
 }
 
+// The paper's angles come first, in its order.
+const ORDER = ["graft_proximal", "graft_distal_planar", "distal_normal", "proximal_distal", "graft_distal"].map((name) => `angle.${name}`);
+const rank = (key) => (ORDER.includes(key) ? ORDER.indexOf(key) : ORDER.length + (key.startsWith("angle.") ? 0 : 1));
+
 // Keys of values that some row has.
-export const quantities = (rows) => [...new Set(rows.flatMap((row) => Object.keys(row)))].filter((key) => rows.some((row) => typeof row[key] === "number")).sort();
+export const quantities = (rows) => [...new Set(rows.flatMap((row) => Object.keys(row)))].filter((key) => rows.some((row) => typeof row[key] === "number"))
+  .sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1));
 
 export function csv(rows, keys) {
   const cell = (x) => (x === null || x === undefined ? "" : /[",\n]/.test(String(x)) ? `"${String(x).replaceAll('"', '""')}"` : String(x));

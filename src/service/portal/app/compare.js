@@ -5,7 +5,7 @@ import { filePath, json, lasting } from "./net.js";
 import { plot } from "./plot.js";
 import { mainJunction } from "./result.js";
 import { setQuery } from "./router.js";
-import { pane, viewButtons } from "./scene.js";
+import { pane, surfaceOf, viewButtons } from "./scene.js";
 import { angleName, countRoles, number, roleName, signed, t, when } from "./text.js";
 
 export async function showCompare(box, { query, signal }) {
@@ -34,8 +34,8 @@ async function both(body, { a, b }, signal) {
   const [first, second] = await Promise.all([a, b].map((id) => lasting(filePath(id, "result.json"))));
   if (signal.aborted) return;
   countRoles(first);
-  const three = pane(t("compare.overlay"), [{ id: a, kind: "side-a" }, { id: b, kind: "side-b" }], { found: first, junction: mainJunction(first), signal });
-  three.tools.append(viewButtons(three.viewer), h("span", { class: "key side-a" }, t("compare.a")), h("span", { class: "key side-b" }, t("compare.b")));
+  const three = pane(t("compare.overlay"), [{ bytes: surfaceOf(a, signal), kind: "side-a" }, { bytes: surfaceOf(b, signal), kind: "side-b" }], { found: first, junction: mainJunction(first), signal });
+  three.tools.append(viewButtons(three.viewer, mainJunction(first)), h("span", { class: "key side-a" }, t("compare.a")), h("span", { class: "key side-b" }, t("compare.b")));
   body.replaceChildren(...[
     h("div", { class: "compare-top" }, three.element, h("div", { class: "stack" }, angles(first, second), branches(first, second))),
     areas(first, second),

@@ -79,7 +79,8 @@ function draw(box, job, parts, signal) {
     await call(jobPath(job.id), { method: "DELETE" });
     location.hash = "#/jobs";
   }, { class: "quiet" });
-  const rerun = isFinal(job) && job.state !== "cancelled" ? button(t("action.again"), async () => {
+  // A failed job is tried again itself.
+  const rerun = job.state === "succeeded" ? button(t("action.again"), async () => {
     const next = await (await post("/v1/jobs", { job: job.id })).json();
     location.hash = `#/jobs/${next.id}`;
   }, { class: "quiet" }) : null;

@@ -62,10 +62,14 @@ window.addEventListener("beforeunload", (e) => document.getElementById("running"
 window.addEventListener("fault", (e) => notice(e.detail));
 window.addEventListener("session", drawHeader);
 applyTheme();
-await loadTexts();
-if (embedded) startEmbedded();
-else {
-  const who = await startSession();
+const texts = loadTexts();
+if (embedded) {
+  await texts;
+  startEmbedded();
+} else {
+  // The session is asked for while the texts are on their way.
+  const who = await startSession(texts);
+  await texts;
   drawHeader();
   if (who.role === "auditor" && !location.hash) history.replaceState(null, "", "#/admin");
 }

@@ -7,7 +7,7 @@ const withBand = (value, band, digits) => (band ? [number(value, digits), h("br"
 
 export function branchCard(found) {
   const rows = found.branches.map((b) => [
-    [h("span", { class: `dot ${roleKind(b)}`, "aria-hidden": "true" }), roleName(b)],
+    h("span", { class: "name" }, h("span", { class: `dot ${roleKind(b)}`, "aria-hidden": "true" }), roleName(b)),
     number(b.length_mm),
     withBand(b.diameter_mm, b.diameter_band95, 2),
     number(b.tortuosity, 3),

@@ -128,7 +128,8 @@ function row(job) {
   return h("tr", {},
     h("td", {}, h("a", { class: "job-link", href: `#/jobs/${job.id}`, title: job.id, "data-key": `open-${job.id}` }, thumb, h("span", {}, name))),
     h("td", { class: "c-created" }, when(job.created_at, "short"), job.sent_by && job.sent_by !== "open" ? [h("br"), h("span", { class: "soft" }, job.sent_by)] : null),
-    h("td", { class: "state-cell" }, stateCell(job)),
+    // A narrow page has no column for it.
+    h("td", { class: "state-cell" }, stateCell(job), h("span", { class: "soft narrow" }, `${t("queue.waited")}: `, h("span", { "data-tick": "waited", "data-job": job.id }, duration(waited(job))))),
     h("td", { class: "number c-waited", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
     h("td", { class: "number c-ran", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),
     h("td", { class: "number c-size" }, `${bytes(job.input.bytes)}`, h("br"), h("span", { class: "soft" }, t("count.files", { n: job.input.files }))),

@@ -17,24 +17,24 @@ async function filesOf(entry) {
   }
 }
 
-// What was dropped as scans: each folder, zip or volume is one, loose files together are one.
+// What was dropped as scans {files, name}: each folder, zip or volume is one, loose files together are one.
 async function scansOf(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
-  if (entries.length === 0) return [[...transfer.files]];
+  if (entries.length === 0) return [{ files: [...transfer.files] }];
   const scans = [];
   const loose = [];
   for (const entry of entries) {
     const files = await filesOf(entry);
-    if (entry.isDirectory || /\.(zip|nii|nii\.gz|mha|nrrd)$/i.test(entry.name)) scans.push(files);
+    if (entry.isDirectory || /\.(zip|nii|nii\.gz|mha|nrrd)$/i.test(entry.name)) scans.push({ files, name: entry.name });
     else loose.push(...files);
   }
-  return [...scans, loose].filter((files) => files.length > 0);
+  return [...scans, { files: loose }].filter((scan) => scan.files.length > 0);
 }
 
 function dropZone() {
-  const take = (files) => { if (files.length > 0) begin(files); };
+  const take = (files, name) => { if (files.length > 0) begin(files, name); };
   const files = h("input", { id: "files", type: "file", multiple: true, class: "unseen", onchange: (e) => { take([...e.target.files]); e.target.value = ""; } });
-  const folder = h("input", { id: "folder", type: "file", webkitdirectory: true, class: "unseen", onchange: (e) => { take([...e.target.files].filter((f) => !f.name.startsWith("."))); e.target.value = ""; } });
+  const folder = h("input", { id: "folder", type: "file", webkitdirectory: true, class: "unseen", onchange: (e) => { take([...e.target.files].filter((f) => !f.name.startsWith(".")), e.target.files[0]?.webkitRelativePath.split("/")[0]); e.target.value = ""; } });
   const zone = h("div", { id: "drop", class: "drop" },
     h("p", { class: "drop-title" }, t("send.drop")),
     h("p", { class: "soft" }, t("send.kinds")),
@@ -46,7 +46,7 @@ function dropZone() {
   zone.addEventListener("drop", async (e) => {
     e.preventDefault();
     zone.classList.remove("over");
-    for (const scan of await scansOf(e.dataTransfer)) begin(scan);
+    for (const { files: scan, name } of await scansOf(e.dataTransfer)) begin(scan, name);
   });
   return zone;
 }
@@ -78,7 +78,8 @@ function scanCard(transfer, signal) {
   const trouble = h("div");
   const checked = h("div");
   const buttons = h("div", { class: "actions" });
-  const title = transfer.files.length === 1 ? transfer.files[0].name : t("count.files", { n: transfer.files.length });
+  const count = t("count.files", { n: transfer.files.length });
+  const title = transfer.files.length === 1 ? transfer.files[0].name : transfer.name ? `${transfer.name} (${count})` : count;
   const element = h("section", { class: "card scan", "aria-label": `${title} (${transfer.number})` },
     h("div", { class: "scan-head" }, h("h2", {}, title), buttons), bar, trouble, checked);
   let begun = false;

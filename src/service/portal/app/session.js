@@ -53,8 +53,12 @@ function ask() {
   return asking;
 }
 
-export async function startSession() {
-  onSignedOut(ask);
+// texts: a promise of what the dialog says.
+export async function startSession(texts) {
+  onSignedOut(async () => {
+    await texts;
+    await ask();
+  });
   const given = location.hash.match(/^#key=(vsk_[0-9a-f]+)$/);
   if (given) {
     // The key leaves the address bar and the history at once.

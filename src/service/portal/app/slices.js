@@ -1,6 +1,6 @@
 // The grey planes with their contours: one tile of slices.jpg at a time, moved by a slider, pointed into by mouse or keys.
 import { h, s } from "./dom.js";
-import { t } from "./text.js";
+import { number, t } from "./text.js";
 
 const add = (a, b, f) => a.map((x, i) => x + f * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -47,7 +47,7 @@ export class Slices {
     this.slider = h("input", { type: "range", min: 0, max: atlas.planes.length - 1, step: 1, value: this.k, "aria-label": t(`axis.${atlas.axis}`) });
     this.told = h("output", {});
     this.frame = h("div", { class: "slice-frame" }, this.canvas, this.overlay);
-    const zoom = h("input", { type: "checkbox", checked: near && vessel, onchange: () => this.look(zoom.checked ? vessel : [0, 0, columns, rows]) });
+    const zoom = h("input", { type: "checkbox", checked: near && vessel, onchange: () => { this.look(zoom.checked ? vessel : [0, 0, columns, rows]); this.onPlane(this.k); } });
     this.element = h("div", { class: "slices" }, this.frame, h("div", { class: "slice-tools" }, this.slider, this.told),
       vessel ? h("label", { class: "choice" }, zoom, t("slices.near")) : null);
     this.slider.addEventListener("input", () => this.show(Number(this.slider.value), true));
@@ -86,11 +86,10 @@ export class Slices {
     return far.indexOf(Math.min(...far));
   }
 
-  // A tile alone, for the plane in 3D.
-  tile(k = this.k) {
-    const [columns, rows] = this.atlas.tile;
-    const canvas = h("canvas", { width: columns, height: rows });
-    this.paint(canvas, k, [0, 0, columns, rows]);
+  // The part of the tile that is shown, alone, for the plane in 3D.
+  tile() {
+    const canvas = h("canvas", { width: this.part[2], height: this.part[3] });
+    this.paint(canvas, this.k, this.part);
     return canvas;
   }
 
@@ -108,7 +107,7 @@ export class Slices {
     const plane = this.atlas.planes[this.k];
     const n = this.normal.map(Math.abs);
     const axis = n.indexOf(Math.max(...n));
-    const words = t("slices.place", { axis: t(`axis.${this.atlas.axis}`), index: plane.index, name: "xyz"[axis], mm: plane.origin[axis].toFixed(1) });
+    const words = t("slices.place", { axis: t(`axis.${this.atlas.axis}`), index: plane.index, name: "xyz"[axis], mm: number(plane.origin[axis]) });
     this.told.textContent = words;
     this.slider.setAttribute("aria-valuetext", words);
     this.paint(this.canvas, this.k, this.part);

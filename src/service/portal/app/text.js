@@ -47,8 +47,8 @@ export function signed(x, digits = 1) {
   return x > 0 && /[1-9]/.test(text) ? `+${text}` : text;
 }
 
-export const when = (text, dateStyle = "medium") =>
-  text ? new Date(text).toLocaleString(region(), { dateStyle, timeStyle: "short" }) : "–";
+export const when = (text, dateStyle = "medium", timeStyle = "short") =>
+  text ? new Date(text).toLocaleString(region(), { dateStyle, timeStyle }) : "–";
 
 export const bytes = (n) => {
   const steps = [["B", 1], ["kB", 1e3], ["MB", 1e6], ["GB", 1e9]];
@@ -82,10 +82,14 @@ export function countRoles(found) {
 export function angleName(name) {
   if (has(`angle.${name}`)) return t(`angle.${name}`);
   const words = ROLES.reduce((text, role) => text.replaceAll(role, t(`role.${role}`)), name);
-  return words.replace(/_planar$/, t("angle.planar")).replace(/_normal$/, t("angle.normal")).replaceAll("_", " – ");
+  const put = words.replace(/_planar$/, t("angle.planar")).replace(/_normal$/, t("angle.normal")).replaceAll("_", " – ");
+  return put.charAt(0).toUpperCase() + put.slice(1);
 }
 
 export const place = (where) =>
   Object.entries(where ?? {})
-    .map(([key, value]) => `${has(`place.${key}`) ? t(`place.${key}`) : key} ${Array.isArray(value) ? value.map((x) => number(x)).join(", ") : value}`)
+    .map(([key, value]) => {
+      const name = has(`place.${key}`) ? t(`place.${key}`) : key;
+      return Array.isArray(value) ? `${name} ${value.map((x) => number(x)).join(", ")} mm` : `${name} ${value}`;
+    })
     .join(", ");

@@ -27,10 +27,12 @@ export function watchTransfers(handler, signal) {
 let numbers = 0;
 
 class Transfer {
-  constructor(files) {
+  // name: the folder's, for the reader alone; it is not sent.
+  constructor(files, name) {
     numbers += 1;
     this.number = numbers;
     this.files = files;
+    this.name = name;
     this.size = files.reduce((n, f) => n + f.size, 0);
     this.state = "packing";
     this.done = 0;
@@ -146,8 +148,8 @@ function faultOf(error) {
   }
 }
 
-export function begin(files) {
-  const transfer = new Transfer(files);
+export function begin(files, name) {
+  const transfer = new Transfer(files, name);
   transfers.unshift(transfer);
   transfer.change({});
   transfer.start();

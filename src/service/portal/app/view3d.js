@@ -1,13 +1,14 @@
 // The 3D viewer: surface.glb (wall, caps and medial lines), angles as arcs with labels, a slice as a plane that may cut the
 // wall, a marker. Drawn in mm, Y to the head, Z to the front, as surface.glb lies; LPS points are turned on the way in.
 import {
-  AmbientLight, BufferAttribute, Box3, CanvasTexture, CatmullRomCurve3, Color, DirectionalLight, DoubleSide, Group, Mesh,
+  AmbientLight, Box3, CanvasTexture, CatmullRomCurve3, Color, DirectionalLight, DoubleSide, Group, Mesh,
   MeshBasicMaterial, MeshStandardMaterial, PerspectiveCamera, Plane, PlaneGeometry, Raycaster, Scene, SphereGeometry,
   SRGBColorSpace, TubeGeometry, Vector2, Vector3, WebGLRenderer, Matrix4,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 import { arcPoints } from "./arcs.js";
+import { apart, commonDisplacement, displacementColours, shapeColour, smallestAngle, triangleColours } from "./walls.js";
 
 export const available = true;
 
@@ -16,6 +17,10 @@ const toLps = ({ x, y, z }) => [x, -z, y];
 const ROLES = ["graft", "proximal", "distal", "host_a", "host_b"];
 const DIRECTIONS = { front: new Vector3(0, 0, 1), left: new Vector3(1, 0, 0), head: new Vector3(0, 1, 0.001) };
 const OPACITY = 0.42;
+// Half the width and height of an angle's label, pixels.
+const TAG = [50, 20];
+// A junction is seen with this many of its graft's diameters around it: a tree has more vessels than one picture can show.
+const NEAR = 18;
 // Seen a little from above and from the side, so that a slice is no mere line.
 const TILT = [0.2, 0.16];
 
@@ -84,7 +89,7 @@ class Viewer {
     const solid = kind === "side-a";
     const material = new MeshStandardMaterial({ roughness: 0.6, metalness: 0, transparent: !solid, opacity: solid ? 1 : OPACITY, side: DoubleSide, depthWrite: solid });
     const made = new Mesh(mesh.geometry, material);
-    made.userData = { wall: true, kind };
+    made.userData = { wall: true, kind, smooth: mesh.geometry };
     made.renderOrder = solid ? 0 : 2;
     return made;
   }
@@ -112,24 +117,51 @@ class Viewer {
 
   each(work) { this.body.traverse((node) => node.userData.wall && work(node)); }
 
-  // clear, solid, displacement or none.
-  wall(mode) {
-    const most = Math.max(...["min", "max"].map((k) => Math.abs(this.found?.surface.displacement_mm?.[k] ?? 0)), 1e-9);
+  // clear, solid, displacement, patches (of: {FaceId, PatchId} by triangle and {shade}, a patch's colour by name), quality or
+  // none. What a legend needs to tell: {most} of the displacement in mm, {patches} with the number of each.
+  wall(mode, of = {}) {
+    const coloured = ["displacement", "patches", "quality"].includes(mode);
+    const told = {};
+    const values = (node) => node.userData.smooth.getAttribute("_displacement_mm");
+    if (mode === "displacement") {
+      const walls = [];
+      this.each((node) => walls.push(values(node)));
+      told.most = commonDisplacement(walls);
+    }
+    if (mode === "patches") told.patches = [...new Set(of.PatchId.filter((_, t) => of.FaceId[t] === 0))].sort((a, b) => a - b);
     this.each((node) => {
-      const solid = mode === "solid" || mode === "displacement";
-      const values = node.geometry.getAttribute("_displacement_mm");
-      const coloured = mode === "displacement" && values;
-      if (coloured && !node.geometry.getAttribute("color")) node.geometry.setAttribute("color", rampColours(values, most));
-      Object.assign(node.material, { opacity: solid ? 1 : OPACITY, transparent: !solid, depthWrite: solid, vertexColors: Boolean(coloured), needsUpdate: true });
+      const { smooth } = node.userData;
+      if (node.geometry !== smooth) node.geometry.dispose();
+      node.geometry = smooth;
+      if (mode === "displacement") smooth.setAttribute("color", displacementColours(values(node), told.most));
+      if (mode === "patches") node.geometry = this.patched(smooth, of);
+      if (mode === "quality") node.geometry = shaped(smooth);
+      const solid = coloured || mode === "solid";
+      Object.assign(node.material, { opacity: solid ? 1 : OPACITY, transparent: !solid, depthWrite: solid, vertexColors: coloured, needsUpdate: true });
       if (coloured) node.material.color.set(0xffffff);
       node.visible = mode !== "none";
     });
     this.colours();
     this.draw();
+    return told;
   }
 
-  // Arcs with labels; size is the graft's diameter.
-  angles(list, size) {
+  // A cap is no patch: it keeps the wall's colour.
+  patched(smooth, { FaceId, PatchId, shade }) {
+    const face = smooth.userData.face_id ?? 0;
+    const mine = PatchId.filter((_, t) => FaceId[t] === face);
+    const made = apart(smooth);
+    if (made.getAttribute("position").count !== 3 * mine.length) throw new Error("surface.vtp has other triangles than surface.glb");
+    const shades = new Map([...new Set(mine)].map((id) => [id, new Color(this.css(face === 0 ? `--${shade(id)}` : "--wall"))]));
+    triangleColours(made, (t) => shades.get(mine[t]));
+    return made;
+  }
+
+  // Arcs with labels at a junction; size is the graft's diameter there. Another junction is looked at.
+  angles(junction, list, size) {
+    const elsewhere = this.junction?.node !== junction?.node;
+    Object.assign(this, { junction, size });
+    if (elsewhere && junction) this.look("plane");
     give(this.arcs);
     this.arcs.clear();
     this.labels.replaceChildren();
@@ -151,7 +183,7 @@ class Viewer {
       note.textContent = arc.note;
       tag.append(arc.text, note);
       this.labels.append(tag);
-      return { tag, at: lps(arcPoints(arc, radius * 1.12)[16]) };
+      return { tag, at: points[16], vertex };
     });
     this.colours();
     this.draw();
@@ -160,7 +192,7 @@ class Viewer {
   // The plane of the slices' present tile; cut takes away what lies on the viewer's side of it.
   plane(slices, { cut = false, plane = true } = {}) {
     // Moving along a curve asks often for the plane that is there.
-    const key = slices && JSON.stringify([slices.k, cut, plane]);
+    const key = slices && JSON.stringify([slices.k, slices.part, cut, plane]);
     if (this.laid === key) return;
     this.laid = key;
     if (this.sheet) {
@@ -181,12 +213,13 @@ class Viewer {
   }
 
   sheetOf(slices) {
-    const { u, v, tile: [columns, rows], pixel_mm: mm } = slices.atlas;
+    const { u, v, pixel_mm: mm } = slices.atlas;
+    const [left, top, columns, rows] = slices.part;
     const map = new CanvasTexture(slices.tile());
     map.colorSpace = SRGBColorSpace;
     const sheet = new Mesh(new PlaneGeometry(columns * mm, rows * mm), new MeshBasicMaterial({ map, side: DoubleSide, transparent: true, opacity: 0.7, depthWrite: false }));
     const [x, y] = [lps(u), lps(v).negate()];
-    const centre = slices.toPatient([(columns - 1) / 2, (rows - 1) / 2]);
+    const centre = slices.toPatient([left + (columns - 1) / 2, top + (rows - 1) / 2]);
     sheet.matrixAutoUpdate = false;
     sheet.matrix.copy(new Matrix4().makeBasis(x, y, x.clone().cross(y)).setPosition(lps(centre)));
     sheet.renderOrder = 1;
@@ -216,9 +249,10 @@ class Viewer {
   look(name) {
     const normal = this.junction?.plane_normal ? lps(this.junction.plane_normal) : DIRECTIONS.front;
     const from = name === "plane" ? normal.clone().multiplyScalar(normal.z < 0 ? -1 : 1) : DIRECTIONS[name];
-    const centre = this.bounds.getCenter(new Vector3());
+    const near = name === "plane" && this.junction?.axes_point && this.size ? Math.min(1, (NEAR * this.size) / this.extent) : 1;
+    const centre = near < 1 ? lps(this.junction.axes_point) : this.bounds.getCenter(new Vector3());
     if (name === "plane") from.add(new Vector3(TILT[0], TILT[1], 0).multiplyScalar(from.length()));
-    const distance = (0.56 * this.extent) / Math.tan((this.camera.fov * Math.PI) / 360);
+    const distance = (0.56 * near * this.extent) / Math.tan((this.camera.fov * Math.PI) / 360);
     Object.assign(this.camera, { near: this.extent / 200, far: this.extent * 20 });
     this.camera.position.copy(centre).addScaledVector(from.clone().normalize(), distance);
     this.controls.target.copy(centre);
@@ -260,14 +294,21 @@ class Viewer {
     if (this.gone) return;
     this.renderer.render(this.scene, this.camera);
     const { clientWidth: width, clientHeight: height } = this.box;
+    const seen = (p) => { const q = p.clone().project(this.camera); return [((q.x + 1) / 2) * width, ((1 - q.y) / 2) * height]; };
     const placed = [];
-    for (const { tag, at } of this.tags ?? []) {
-      const p = at.clone().project(this.camera);
-      const x = Math.min(width - 60, Math.max(60, ((p.x + 1) / 2) * width));
-      let y = Math.min(height - 24, Math.max(24, ((1 - p.y) / 2) * height));
-      // A label that would cover another goes below it.
-      while (placed.some((q) => Math.abs(q.x - x) < 104 && Math.abs(q.y - y) < 38)) y += 6;
-      placed.push({ x, y });
+    for (const { tag, at, vertex } of this.tags ?? []) {
+      const [from, to] = [seen(vertex), seen(at)];
+      const long = Math.hypot(to[0] - from[0], to[1] - from[1]) || 1;
+      const way = [(to[0] - from[0]) / long, (to[1] - from[1]) / long];
+      // Outside of its arc, as far as its own size asks; further out where it would cover another.
+      let off = Math.abs(way[0]) * TAG[0] + Math.abs(way[1]) * TAG[1] + 4;
+      const place = () => [Math.min(width - TAG[0], Math.max(TAG[0], to[0] + way[0] * off)), Math.min(height - TAG[1], Math.max(TAG[1], to[1] + way[1] * off))];
+      let [x, y] = place();
+      for (let k = 0; k < 30 && placed.some((q) => Math.abs(q[0] - x) < 2 * TAG[0] && Math.abs(q[1] - y) < 2 * TAG[1]); k += 1) {
+        off += 6;
+        [x, y] = place();
+      }
+      placed.push([x, y]);
       tag.style.transform = `translate(-50%, -50%) translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     }
   }
@@ -295,17 +336,11 @@ function give(root) {
   });
 }
 
-// Blue inward, white none, red outward.
-function rampColours(values, most) {
-  const colours = new Float32Array(values.count * 3);
-  const [low, middle, high] = ["#2166ac", "#f7f7f7", "#b2182b"].map((c) => new Color(c));
-  const mixed = new Color();
-  for (let i = 0; i < values.count; i += 1) {
-    const f = Math.max(-1, Math.min(1, values.getX(i) / most));
-    mixed.copy(middle).lerp(f < 0 ? low : high, Math.abs(f));
-    mixed.toArray(colours, 3 * i);
-  }
-  return new BufferAttribute(colours, 3);
+function shaped(smooth) {
+  const made = apart(smooth);
+  const position = made.getAttribute("position");
+  triangleColours(made, (t) => shapeColour(smallestAngle(position, t)));
+  return made;
 }
 
 // parts: [{bytes of surface.glb, kind}]; kind names a colour where several surfaces lie over one another.
