@@ -5,7 +5,7 @@
 //! moved centres, in the windows of the measurement itself. So a draw costs 24 values of delta per section instead of a
 //! measurement of its own, some 1200; the error is of second order in delta over the radius.
 //!
-//! A band is the value +- 1.96 standard deviations of the draws about it. Quantiles of 24 draws would have four times the
+//! A band is the value +- 2.06 standard deviations of the draws about it (Student's quantile). Quantiles of 24 draws would have four times the
 //! scatter. What bands do not hold: biases of the segmentation that all draws share (the half level of a blurred oblique
 //! wall), and a wrong graph.
 
