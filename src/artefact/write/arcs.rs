@@ -1,6 +1,7 @@
 //! A junction's angles as arcs in the report's pictures: between which directions each stands, drawn where it is least
 //! foreshortened.
 
+use super::html::LETTER;
 use super::render::Camera;
 use super::style::{ANGLE_RGB, hex};
 use crate::Reconstruction;
@@ -165,8 +166,18 @@ impl Arc {
             svg,
             "<path d=\"{path}\" fill=\"none\" stroke=\"#fff\" stroke-width=\"7\" stroke-linejoin=\"round\"/><path d=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"3.5\" stroke-linejoin=\"round\"/>"
         );
-        let [x, y, _] = pixel(self.at(self.radius_mm, 0.5 * angle));
-        let [x0, y0, _] = pixel(self.vertex);
+        let (at, anchor) = self.value_at(camera);
+        super::html::label(svg, at, anchor, &colour, &self.words());
+    }
+
+    fn words(&self) -> String {
+        format!("{:.1}\u{b0}", self.value_deg)
+    }
+
+    /// Where the value stands: outside the middle of the arc.
+    fn value_at(&self, camera: &Camera) -> ([f64; 2], &'static str) {
+        let [x, y, _] = camera.project(self.at(self.radius_mm, 0.5 * self.from.angle_to(self.to)));
+        let [x0, y0, _] = camera.project(self.vertex);
         let length = (x - x0).hypot(y - y0).max(1e-9);
         let (dx, dy) = ((x - x0) / length, (y - y0) / length);
         let anchor = if dx > 0.35 {
@@ -176,8 +187,26 @@ impl Arc {
         } else {
             "middle"
         };
-        let at = [x + 12.0 * dx, y + 26.0 * dy + 9.0];
-        super::html::label(svg, at, anchor, &colour, &format!("{:.1}\u{b0}", self.value_deg));
+        ([x + 12.0 * dx, y + 26.0 * dy + 9.0], anchor)
+    }
+
+    /// What the value and the arc take of the picture: left, right and base line of a text, and of each piece of the arc as
+    /// if it were one.
+    pub(super) fn room(&self, camera: &Camera) -> Vec<[f64; 3]> {
+        let ([x, y], anchor) = self.value_at(camera);
+        let wide = LETTER[0] * self.words().chars().count() as f64;
+        let left = x - match anchor {
+            "start" => 0.0,
+            "end" => wide,
+            _ => 0.5 * wide,
+        };
+        let angle = self.from.angle_to(self.to);
+        let piece = |i: usize| {
+            let [x, y, _] = camera.project(self.at(self.radius_mm, angle * i as f64 / PIECES as f64));
+            // The middle of a letter is a third of its line above the base line.
+            [x - 4.0, x + 4.0, y + LETTER[1] / 3.0]
+        };
+        (0..=PIECES).map(piece).chain([[left, left + wide, y]]).collect()
     }
 }
 

@@ -14,7 +14,7 @@ use crate::reconstruction::SlicePicture;
 use askama::Template;
 use image::ExtendedColorType;
 use morphometry::{Angle, Branch, Junction, Role};
-use space::V3;
+use space::{P3, V3};
 use std::fmt::Write as _;
 
 /// Warnings printed.
@@ -237,14 +237,17 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera, all: &[Camera]) -> Result<S
     let mut svg = format!(
         "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"surface with medial lines\"><image width=\"{width}\" height=\"{height}\" href=\"data:image/png;base64,{png}\"/>"
     );
-    let mut taken = Vec::new();
-    for b in r.morphometry.branches.iter().filter(|b| b.role != Role::Other) {
+    let main = r.main_junction();
+    let mut arcs = main.map_or_else(Vec::new, |j| super::arcs::arcs(r, j));
+    arcs.retain(|arc| arc.is_for(camera, all));
+    let mut taken: Vec<[f64; 3]> = arcs.iter().flat_map(|arc| arc.room(camera)).collect();
+    // Of a tree's many branches those are named whose angles are shown.
+    let named = |b: &&Branch| b.role != Role::Other && main.is_none_or(|j| j.branches.contains(&b.id));
+    for b in r.morphometry.branches.iter().filter(named) {
         branch_label(&mut svg, r, camera, b, &mut taken);
     }
-    for arc in r.main_junction().map_or_else(Vec::new, |j| super::arcs::arcs(r, j)) {
-        if arc.is_for(camera, all) {
-            arc.draw(&mut svg, camera);
-        }
+    for arc in &arcs {
+        arc.draw(&mut svg, camera);
     }
     scale_bar(&mut svg, camera);
     directions(&mut svg, camera);
@@ -253,27 +256,42 @@ fn view_svg(r: &Reconstruction<'_>, camera: &Camera, all: &[Camera]) -> Result<S
 }
 
 /// Width of a letter of a label and height of its line, px.
-const LETTER: [f64; 2] = [14.0, 30.0];
+pub(super) const LETTER: [f64; 2] = [14.0, 30.0];
+/// Where along a branch its name is tried.
+const NAMED_AT: [f64; 4] = [0.67, 0.85, 0.5, 0.33];
 
-/// A branch's name beside the vessel, two thirds along the branch, on the side to which it leans; on the other side where
-/// a name stands already (`taken`: left, right and base line of each).
+/// A branch's name beside the vessel, on the side to which it leans if nothing stands there (`taken`: left, right and base
+/// line of what does). A name without room is left out: the legend has its colour.
 fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &Branch, taken: &mut Vec<[f64; 3]>) {
     let Some(e) = r.graph.edges.get(b.id) else { return };
-    let n = e.points.len();
-    let k = if e.nodes[1] == b.to_node { n * 2 / 3 } else { n.saturating_sub(1 + n * 2 / 3) };
-    let (Some(&p), Some(&first), Some(radius)) = (e.points.get(k), e.points.first(), e.radius_mm.get(k)) else {
-        return;
+    let words = role_words(b.role);
+    let is_free = |&(.., [left, right, y]): &LabelPlace| {
+        taken.iter().all(|t: &[f64; 3]| right < t[0] || left > t[1] || (y - t[2]).abs() > LETTER[1])
     };
-    let start = if e.nodes[1] == b.to_node { first } else { e.points.last().copied().unwrap_or(first) };
-    if !(p.is_finite() && start.is_finite() && radius.is_finite()) {
-        return;
+    let n = e.points.len();
+    let found = NAMED_AT.iter().find_map(|part| {
+        let k = ((n as f64 * part) as usize).min(n.saturating_sub(1));
+        let (k, start) = if e.nodes[1] == b.to_node { (k, 0) } else { (n.saturating_sub(1 + k), n.saturating_sub(1)) };
+        let (&p, &start, &radius) = (e.points.get(k)?, e.points.get(start)?, e.radius_mm.get(k)?);
+        let finite = p.is_finite() && start.is_finite() && radius.is_finite();
+        if finite { label_places(camera, [start, p], radius, words).into_iter().find(is_free) } else { None }
+    });
+    if let Some((x, y, anchor, extent)) = found {
+        taken.push(extent);
+        label(svg, [x, y], anchor, &hex(role_rgb(b.role)), words);
     }
+}
+
+/// Base point, anchor, and left, right and base line of a text.
+type LabelPlace = (f64, f64, &'static str, [f64; 3]);
+
+/// The two places beside a vessel that comes from `start` to `p`, the better first.
+fn label_places(camera: &Camera, [start, p]: [P3; 2], radius: f64, words: &str) -> [LabelPlace; 2] {
     let ([x, y, _], [x0, y0, _]) = (camera.project(p), camera.project(start));
     let length = (x - x0).hypot(y - y0).max(1e-9);
     let (dx, dy) = ((x - x0) / length, (y - y0) / length);
     let off = 1.15 * radius / camera.mm_per_px + 14.0;
     let [width, height] = camera.size.map(|n| n as f64);
-    let words = role_words(b.role);
     let wide = LETTER[0] * words.len() as f64;
     let place = |side: f64| {
         let (nx, ny) = if dy.abs() > 0.3 { (side * dy.abs(), side * -dx * dy.signum()) } else { (0.0, side) };
@@ -291,13 +309,7 @@ fn branch_label(svg: &mut String, r: &Reconstruction<'_>, camera: &Camera, b: &B
     };
     // To the right of a branch that leans right, to the left of any other, under a level one.
     let first = if dx > 0.02 || dy.abs() <= 0.3 { 1.0 } else { -1.0 };
-    let is_free = |[left, right, y]: [f64; 3]| {
-        taken.iter().all(|t: &[f64; 3]| right < t[0] || left > t[1] || (y - t[2]).abs() > LETTER[1])
-    };
-    let sides = [place(first), place(-first)];
-    let (x, y, anchor, extent) = sides.into_iter().find(|s| is_free(s.3)).unwrap_or(sides[0]);
-    taken.push(extent);
-    label(svg, [x, y], anchor, &hex(role_rgb(b.role)), words);
+    [place(first), place(-first)]
 }
 
 pub(super) fn label(svg: &mut String, at: [f64; 2], anchor: &str, colour: &str, words: &str) {
@@ -406,7 +418,28 @@ fn base64(bytes: &[u8]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::fixture::Fixture;
     use super::*;
+
+    #[test]
+    fn a_name_stands_on_nothing_or_is_left_out() {
+        let f = Fixture::new();
+        let r = f.reconstruction();
+        let free = |taken: &[[f64; 3]]| {
+            let apart = |a: &[f64; 3], b: &[f64; 3]| a[1] < b[0] || a[0] > b[1] || (a[2] - b[2]).abs() > LETTER[1];
+            taken.iter().enumerate().all(|(i, a)| taken[..i].iter().all(|b| apart(a, b)))
+        };
+        let times = 2 * NAMED_AT.len() + 1;
+        for camera in cameras(&r, PICTURE) {
+            for b in &r.morphometry.branches {
+                let (mut svg, mut taken) = (String::new(), Vec::new());
+                (0..times).for_each(|_| branch_label(&mut svg, &r, &camera, b, &mut taken));
+                assert!((1..times).contains(&taken.len()), "{} names of {times}", taken.len());
+                assert_eq!(svg.matches("<text").count(), taken.len());
+                assert!(free(&taken));
+            }
+        }
+    }
 
     #[test]
     fn base64_of_rfc_4648() {
