@@ -2,6 +2,7 @@
 
 use crate::arguments::Cohort;
 use crate::jobs::report;
+use crate::terminal::say;
 use artefact::cohort::{Filter, Row, Table, csv, document, plot, spreads};
 use pipeline::Failure;
 use serde_json::Value;
@@ -20,7 +21,7 @@ const SVG: &str = "cohort.svg";
 pub(crate) fn cohort(a: &Cohort) -> ExitCode {
     match made(a) {
         Ok(text) => {
-            print!("{text}");
+            say!("{text}");
             ExitCode::SUCCESS
         }
         Err(failure) => report(&failure, a.json),

@@ -2,6 +2,7 @@
 
 use crate::arguments::{Demo, Image};
 use crate::jobs::{advance, bar};
+use crate::terminal::say;
 use crate::{phantoms, table};
 use anyhow::{Context, Result, bail};
 use futures::StreamExt;
@@ -45,14 +46,14 @@ async fn whole(a: &Demo) -> Result<()> {
         bail!("the job ended as {state}: {}", job["error"]);
     }
     let result = save(&client, &server.address, id, &a.out.join("artefacts")).await?;
-    print!("{}", table::angles(&result, Some(&truth)));
-    println!("artefacts in {}", a.out.join("artefacts").display());
-    println!("portal: {}/#/jobs/{id}", server.address);
+    say!("{}", table::angles(&result, Some(&truth)));
+    say!("artefacts in {}\n", a.out.join("artefacts").display());
+    say!("portal: {}/#/jobs/{id}\n", server.address);
     if a.keep || std::io::stdin().is_terminal() {
-        println!("the service keeps running; press Ctrl-C to stop it");
+        say!("the service keeps running; press Ctrl-C to stop it\n");
         tokio::signal::ctrl_c().await?;
     } else {
-        println!("(the service stops now; run `vasculum demo --keep` to look at the portal)");
+        say!("(the service stops now; run `vasculum demo --keep` to look at the portal)\n");
     }
     Ok(())
 }

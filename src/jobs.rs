@@ -1,6 +1,7 @@
 //! `run`, `validate` and `exec-job`: the pipeline in this process.
 
 use crate::arguments::{ExecJob, Run, Show, Validate};
+use crate::terminal::say;
 use crate::{table, understood};
 use artefact::plan::Plan;
 use artefact::problem::Problem;
@@ -26,7 +27,7 @@ pub(crate) fn run(a: &Run) -> ExitCode {
     });
     match outcome {
         Ok(result) => {
-            print!("{}", if a.json { format!("{result}\n") } else { summary(&result, &a.out) });
+            say!("{}", if a.json { format!("{result}\n") } else { summary(&result, &a.out) });
             ExitCode::SUCCESS
         }
         Err(failure) => report(&failure, a.json),
@@ -38,8 +39,8 @@ pub(crate) fn show(a: &Show) -> ExitCode {
     let file = if a.result.is_dir() { a.result.join(write::RESULT_JSON) } else { a.result.clone() };
     let read = std::fs::read(&file).and_then(|bytes| Ok(serde_json::from_slice::<Value>(&bytes)?));
     match read {
-        Ok(result) if a.json => println!("{result:#}"),
-        Ok(result) => print!("{}", table::summary(&result)),
+        Ok(result) if a.json => say!("{result:#}\n"),
+        Ok(result) => say!("{}", table::summary(&result)),
         Err(e) => return report(&Failure::unreadable(&file, &e), a.json),
     }
     ExitCode::SUCCESS
@@ -60,7 +61,7 @@ pub(crate) fn validate(a: &Validate) -> ExitCode {
     {
         return report(&failure, a.json);
     }
-    print!("{}", if a.json { format!("{:#}\n", understood.facts) } else { understood::words(&understood.facts) });
+    say!("{}", if a.json { format!("{:#}\n", understood.facts) } else { understood::words(&understood.facts) });
     understood.refusal.map_or(ExitCode::SUCCESS, |failure| report(&failure, a.json))
 }
 

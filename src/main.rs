@@ -9,9 +9,11 @@ mod manuals;
 mod phantoms;
 mod serving;
 mod table;
+mod terminal;
 mod understood;
 mod variants;
 
+use crate::terminal::say;
 use arguments::{Arguments, Command};
 use clap::Parser;
 use std::process::ExitCode;
@@ -39,7 +41,7 @@ fn main() -> ExitCode {
         Command::Man(a) => manuals::man(&a),
         Command::Completions(a) => manuals::completions(&a),
         Command::Version => {
-            println!("vasculum {}", env!("CARGO_PKG_VERSION"));
+            say!("vasculum {}\n", env!("CARGO_PKG_VERSION"));
             ExitCode::SUCCESS
         }
     }

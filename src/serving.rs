@@ -1,6 +1,7 @@
 //! `serve`, `work`, `migrate`, `key`, `tenant`, `openapi`.
 
 use crate::arguments::{Backup, Data, Key, KeyAction, OidcArgs, Serve, Tenant, TenantAction, VerifyAudit};
+use crate::terminal::say;
 use artefact::read::{Limits, NamedBytes};
 use artefact::write;
 use serde_json::Value;
@@ -43,15 +44,15 @@ pub(crate) fn key(a: Key) -> ExitCode {
                     Role::of(&role).ok_or_else(|| anyhow::anyhow!("roles are upload, read, admin and auditor"))?;
                 let db = service::open_database(&data_config(data)).await?;
                 let new = NewKey { label: name, role, tenant, requests_per_minute, max_bytes };
-                println!("{}", keys::create(&db, new).await?);
+                say!("{}\n", keys::create(&db, new).await?);
                 db.close().await;
             }
             KeyAction::List { data } => {
                 let db = service::open_database(&data_config(data)).await?;
-                println!("{:<38}{:<16}{:<10}{:<10}label", "id", "tenant", "role", "state");
+                say!("{:<38}{:<16}{:<10}{:<10}label\n", "id", "tenant", "role", "state");
                 for key in keys::list(&db).await? {
                     let state = if key.revoked_at.is_some() { "revoked" } else { "valid" };
-                    println!("{:<38}{:<16}{:<10}{state:<10}{}", key.id, key.tenant, key.role, key.label);
+                    say!("{:<38}{:<16}{:<10}{state:<10}{}\n", key.id, key.tenant, key.role, key.label);
                 }
                 db.close().await;
             }
@@ -78,11 +79,11 @@ pub(crate) fn tenant(a: Tenant) -> ExitCode {
             }
             TenantAction::List { data } => {
                 let db = service::open_database(&data_config(data)).await?;
-                println!("{:<24}{:>12}{:>12}", "tenant", "max running", "kept, days");
+                say!("{:<24}{:>12}{:>12}\n", "tenant", "max running", "kept, days");
                 let shown = |bound: Option<i64>| bound.map_or_else(|| "-".to_owned(), |n| n.to_string());
                 for row in tenants::list(&db).await? {
                     let days = row.keep_ms.map(|ms| ms / 86_400_000);
-                    println!("{:<24}{:>12}{:>12}", row.id, shown(row.max_running), shown(days));
+                    say!("{:<24}{:>12}{:>12}\n", row.id, shown(row.max_running), shown(days));
                 }
                 db.close().await;
             }
@@ -103,7 +104,7 @@ pub(crate) fn verify_audit(a: VerifyAudit) -> ExitCode {
                     break;
                 }
                 after = last;
-                events.iter().for_each(|event| println!("{event}"));
+                events.iter().for_each(|event| say!("{event}\n"));
             }
         }
         let verdict = audit::verify(&db).await?;
@@ -120,7 +121,7 @@ pub(crate) fn verify_audit(a: VerifyAudit) -> ExitCode {
 
 /// Print openapi.yaml.
 pub(crate) fn openapi() -> ExitCode {
-    print!("{}", service::openapi());
+    say!("{}", service::openapi());
     ExitCode::SUCCESS
 }
 

@@ -5,6 +5,7 @@
 
 use crate::arguments::Vary;
 use crate::jobs::{Shown, context, plan_of, report, summary};
+use crate::terminal::say;
 use artefact::plan::{Branch, Plan, ROLES, Variant, VariantChange};
 use pipeline::Failure;
 use serde_json::json;
@@ -31,7 +32,7 @@ fn made(a: &Vary) -> Result<(), Failure> {
         shown.finish();
         let result = outcome?;
         let line = json!({"variant": name, "result": result});
-        print!("{}", if a.json { format!("{line}\n") } else { format!("{name}\n{}", summary(&result, &out)) });
+        say!("{}", if a.json { format!("{line}\n") } else { format!("{name}\n{}", summary(&result, &out)) });
     }
     Ok(())
 }

@@ -3,6 +3,7 @@
 pub mod cohort;
 pub mod field;
 mod named;
+mod next;
 pub mod plan;
 pub mod problem;
 pub mod read;

@@ -191,7 +191,7 @@ impl Problem {
         }
         self
     }
-    /// Plain words for a terminal: what, where, all further faults, the code. No colour, ends with a newline.
+    /// Plain words for a terminal: what, where, what to do next, the code, and so for all further faults. No colour, ends with a newline.
     pub fn plain(&self) -> String {
         let mut out = format!("{}.\n", self.title);
         let several = [Fault { code: self.code.clone(), detail: self.detail.clone(), place: self.place.clone() }];
@@ -201,6 +201,9 @@ impl Problem {
             let _ = write!(out, "  {}", f.detail);
             if let Some(place) = &f.place {
                 let _ = write!(out, "\n    where: {}", place.place());
+            }
+            if let Some(step) = crate::next::next_step(&f.code) {
+                let _ = write!(out, "\n    next:  {step}");
             }
             let _ = writeln!(out, "\n    code:  {}", f.code);
         }
@@ -259,6 +262,12 @@ mod tests {
         let text = p.plain();
         assert!(text.contains("contour 1 of slice 7") && text.contains("where: slice 7, contour 2"), "{text}");
         assert!(Problem::of_all([]).is_none());
+    }
+
+    #[test]
+    fn the_command_line_tells_what_to_do_next() {
+        let p = Problem::new(422, "segmentation.no_vessel", "The scan cannot be used", "no vessel was found");
+        assert!(p.plain().contains("next:  set segmentation.seeds_mm"), "{}", p.plain());
     }
 
     #[test]

@@ -68,6 +68,14 @@ def narrow():
     return told
 
 
+def unread():
+    """A reader who has seen enough is no fault of anybody."""
+    for command in (["show", str(out), "--json"], ["openapi"], ["man"]):
+        program = subprocess.Popen([binary, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        program.stdout.close()
+        assert program.wait(60) == 0 and program.stderr.read() == b"", command
+
+
 def shown(text):
     result = json.loads((out / "result.json").read_text())
     for angle in result["junctions"][0]["angles"]:
@@ -85,6 +93,8 @@ def main():
     shown(told["show"])
     missing = subprocess.run([binary, "show", "no-such-folder"], capture_output=True, text=True, timeout=60)
     assert missing.returncode == 2 and "input.unreadable" in missing.stderr
+    assert "next:  check the path" in missing.stderr, missing.stderr
+    unread()
     print(f"command line: {pages} pages of the manual without a warning of groff, completions in bash, {len(told)} tables within 80 columns")
 
 
