@@ -118,6 +118,8 @@ fn run(command: Command) -> Result<()> {
 }
 
 fn demo(seed: u64, keep: bool) -> Result<()> {
+    // Without it the portal of `--keep` would lack its 3D view.
+    tools::node()?;
     let binary = tools::release_binary()?;
     let out = shell::root()?.join("demo");
     let mut command = shell::command(&binary);
