@@ -473,6 +473,29 @@ async function german() {
   await page.getByLabel("Sprache").selectOption("en");
 }
 
+// What a key may not do is not offered: a reader's result has no button that changes something, an auditor begins at the audit.
+async function lesserRoles(id) {
+  const keyOf = async (role) => (await (await api("/v1/keys", { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ label: role, role }) })).json()).key;
+  const visit = async (role, ready) => {
+    const other = await browser.newContext({ viewport: { width: 1280, height: 720 }, locale: "en-GB" });
+    const view = await other.newPage();
+    watch(view);
+    await view.goto(`${address}/#key=${await keyOf(role)}`);
+    await view.locator(ready).first().waitFor();
+    return view;
+  };
+  const reader = await visit("read", "#queue tr");
+  assert.deepEqual(await reader.getByRole("button", { name: /^(Cancel|Try again|Raise|Lower)/ }).count(), 0);
+  await reader.goto(`${address}/#/jobs/${id}`);
+  await reader.locator(".scene canvas").waitFor({ timeout: LONG });
+  assert.equal(await reader.getByRole("button", { name: /^(Run again|Erase|Link|Measure|Make them)/ }).count(), 0);
+  await reader.getByRole("link", { name: "Report", exact: true }).waitFor();
+  await reader.context().close();
+  const auditor = await visit("auditor", ".audit tbody tr");
+  assert.match(auditor.url(), /#\/admin$/);
+  await auditor.context().close();
+}
+
 // Results opened and closed give back what they took.
 async function lean(id) {
   const session = await context.newCDPSession(page);
@@ -509,6 +532,7 @@ try {
   await cohort();
   await framed(id);
   await german();
+  await lesserRoles(id);
   await lean(id);
   const code = [...scripts.values()].reduce((n, body) => n + brotliCompressSync(body).length, 0);
   assert.ok(code > 50_000 && code <= MOST_CODE, `${code} bytes of code`);

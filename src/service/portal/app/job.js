@@ -6,6 +6,7 @@ import { problemBox } from "./faults.js";
 import { call, jobPath, json, post } from "./net.js";
 import { actions, isFinal, ran, stageName, stateCell, waited } from "./queue.js";
 import { showResult } from "./result.js";
+import { mayChange } from "./session.js";
 import { bytes, duration, t, when } from "./text.js";
 import { Held } from "./transfer.js";
 
@@ -80,7 +81,7 @@ function draw(box, job, parts, signal) {
     location.hash = "#/jobs";
   }, { class: "quiet" });
   // A failed job is tried again itself.
-  const rerun = job.state === "succeeded" ? button(t("action.again"), async () => {
+  const rerun = job.state === "succeeded" && mayChange() ? button(t("action.again"), async () => {
     const next = await (await post("/v1/jobs", { job: job.id })).json();
     location.hash = `#/jobs/${next.id}`;
   }, { class: "quiet" }) : null;
@@ -88,10 +89,10 @@ function draw(box, job, parts, signal) {
   box.replaceChildren(
     h("div", { class: "title" },
       h("h1", {}, t("job.title", { name })), parts.line,
-      h("div", { class: "actions" }, report, embedded ? null : [actions(job, { name, after: again }), rerun, job.state === "succeeded" ? shareButton(job) : null, isFinal(job) ? erase : null])),
+      h("div", { class: "actions" }, report, embedded ? null : [actions(job, { name, after: again }), rerun, job.state === "succeeded" && mayChange() ? shareButton(job) : null, isFinal(job) && mayChange() ? erase : null])),
     h("p", { class: "soft facts-line" }, t("job.facts", { when: [when(job.created_at), job.sent_by === "open" ? "" : job.sent_by].filter(Boolean).join(", "), files: t("count.files", { n: job.input.files }), size: bytes(job.input.bytes), waited: duration(waited(job)), ran: duration(ran(job)) })),
     parts.steps);
   progress(job, parts);
-  if (job.error) box.append(problemBox(job.error, t("job.why")), embedded ? "" : mending(job, signal));
+  if (job.error) box.append(problemBox(job.error, t("job.why")), mayChange() ? mending(job, signal) : "");
   if (job.state === "cancelled") box.append(h("p", { class: "empty" }, t("job.cancelled")));
 }

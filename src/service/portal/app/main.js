@@ -7,9 +7,9 @@ import { embedded, startEmbedded } from "./embed.js";
 import { notice } from "./faults.js";
 import { showJob } from "./job.js";
 import { showQueue } from "./queue.js";
-import { clear, route } from "./router.js";
+import { clear, readAddress, route } from "./router.js";
 import { showSend } from "./send.js";
-import { endSession, startSession, whoami } from "./session.js";
+import { endSession, isAuditor, startSession, whoami } from "./session.js";
 import { LANGUAGES, currentLanguage, loadTexts, setLanguage, t } from "./text.js";
 import { applyTheme, nextTheme } from "./theme.js";
 import { onTransfers } from "./transfer.js";
@@ -19,7 +19,10 @@ const NAV = ["send", "jobs", "compare", "cohort", "admin"];
 // What a role finds: the service refuses the rest anyway.
 const MAY = { read: ["jobs", "compare", "cohort"], upload: ["send", "jobs", "compare", "cohort"], auditor: ["admin"] };
 const SIGNS = { auto: "◐", light: "☀", dark: "☾" };
-const go = () => route(VIEWS);
+const go = () => {
+  if (isAuditor() && readAddress().name === "jobs") history.replaceState(null, "", "#/admin");
+  return route(VIEWS);
+};
 
 function drawHeader() {
   const running = h("span", { id: "running", class: "badge", hidden: true });
@@ -68,10 +71,9 @@ if (embedded) {
   startEmbedded();
 } else {
   // The session is asked for while the texts are on their way.
-  const who = await startSession(texts);
+  await startSession(texts);
   await texts;
   drawHeader();
-  if (who.role === "auditor" && !location.hash) history.replaceState(null, "", "#/admin");
 }
 document.getElementById("foot").textContent = t("foot.research");
 window.addEventListener("hashchange", go);

@@ -3,6 +3,7 @@ import { button, card, field, h, redraw, select } from "./dom.js";
 import { recovered, notice } from "./faults.js";
 import { call, filePath, jobPath, json, pause } from "./net.js";
 import { setQuery } from "./router.js";
+import { mayChange } from "./session.js";
 import { bytes, duration, number, t, when } from "./text.js";
 
 const POLL_MS = 1000;
@@ -32,7 +33,7 @@ export async function showQueue(box, { query, signal }) {
   };
   const search = h("input", { type: "search", value: view.text, placeholder: t("queue.search_hint"), oninput: () => { view.text = search.value; changed(); } });
   const state = select([["", t("queue.all")], ...STATES.map((s) => [s, t(`state.${s}`)])], view.state, (value) => { view.state = value; changed(); });
-  box.append(h("div", { class: "title" }, h("h1", {}, t("title.jobs")), h("div", { class: "actions" }, h("a", { class: "button", href: "#/send" }, t("nav.send")))),
+  box.append(h("div", { class: "title" }, h("h1", {}, t("title.jobs")), h("div", { class: "actions" }, mayChange() ? h("a", { class: "button", href: "#/send" }, t("nav.send")) : null)),
     parts.stats,
     card(null, h("div", { class: "filters" }, field(t("queue.search"), search), field(t("queue.state"), state)),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": t("title.jobs") },
@@ -133,7 +134,7 @@ function row(job) {
     h("td", { class: "number c-waited", "data-tick": "waited", "data-job": job.id }, duration(waited(job))),
     h("td", { class: "number c-ran", "data-tick": "ran", "data-job": job.id }, duration(ran(job))),
     h("td", { class: "number c-size" }, `${bytes(job.input.bytes)}`, h("br"), h("span", { class: "soft" }, t("count.files", { n: job.input.files }))),
-    h("td", { class: "number" }, job.state === "queued" ? mover(job) : String(job.priority)),
+    h("td", { class: "number" }, job.state === "queued" && mayChange() ? mover(job) : String(job.priority)),
     h("td", {}, h("div", { class: "actions" }, actions(job, { name }))));
 }
 
@@ -151,8 +152,8 @@ export function actions(job, { name, after = () => {} }) {
   const act = (key, path, method, label) => button(t(key), async () => { await call(path, { method }); after(key); },
     { class: "quiet", "data-key": `${key}-${job.id}`, "aria-label": `${t(key)} ${label}` });
   return [
-    FINAL.includes(job.state) ? null : act("action.cancel", `${jobPath(job.id)}/cancel`, "POST", name),
-    job.state === "failed" ? act("action.retry", `${jobPath(job.id)}/retry`, "POST", name) : null,
+    FINAL.includes(job.state) || !mayChange() ? null : act("action.cancel", `${jobPath(job.id)}/cancel`, "POST", name),
+    job.state === "failed" && mayChange() ? act("action.retry", `${jobPath(job.id)}/retry`, "POST", name) : null,
     job.state === "succeeded" ? h("a", { class: "button quiet", href: `#/compare?a=${job.id}`, "data-key": `compare-${job.id}`, "aria-label": `${t("action.compare")} ${name}` }, t("action.compare")) : null,
   ];
 }

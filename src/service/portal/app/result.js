@@ -8,6 +8,7 @@ import { call, filePath, json, jobPath, lasting } from "./net.js";
 import { files } from "./files.js";
 import { branchCard, qualityCard } from "./quality.js";
 import { rolesPanel } from "./roles.js";
+import { mayChange } from "./session.js";
 import { picture, Slices } from "./slices.js";
 import { countRoles, number, place, t } from "./text.js";
 import { scene, surfaceOf } from "./scene.js";
@@ -81,7 +82,7 @@ export async function showResult(box, job, { signal }) {
     three.angles(shown.junction, firstShown(shown.junction));
   }
   drawAngles();
-  const changes = embedded ? [] : [rolesPanel(job, found, signal), list.items.some((f) => f.name === "sections.json") ? varyPanel(job, found, signal) : null].filter(Boolean);
+  const changes = !mayChange() ? [] : [rolesPanel(job, found, signal), list.items.some((f) => f.name === "sections.json") ? varyPanel(job, found, signal) : null].filter(Boolean);
   shell.replaceChildren(warnings(found.warnings, (point) => { focus.tell(null, { point }); views.scrollIntoView({ block: "nearest" }); }), h("div", { class: "result-top" }, views, angles),
     changes.length > 0 ? h("div", { class: "result-changes" }, changes) : "", curves, h("div", { class: "result-tables" }, tables, embedded ? null : files(list.items)));
   await slicesBeside(views, job, list.items, { focus, three, shown }, signal);

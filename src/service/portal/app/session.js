@@ -9,8 +9,14 @@ let known = null;
 
 async function begin(key) {
   await call("/v1/session", { method: "POST", once: true, headers: { "content-type": "application/json" }, body: JSON.stringify({ key }) });
-  known = null;
+  known = await json("/v1/session", { once: true });
 }
+
+// Whether who is signed in may send, cancel, run again, erase: what cannot be done is not offered. The service refuses it anyway.
+export const mayChange = () => ["upload", "admin"].includes(known?.role);
+
+// An auditor sees the audit and nothing else.
+export const isAuditor = () => known?.role === "auditor";
 
 // Who is signed in: {keys, tenant, role}.
 export async function whoami() {

@@ -17,6 +17,8 @@ const toLps = ({ x, y, z }) => [x, -z, y];
 const ROLES = ["graft", "proximal", "distal", "host_a", "host_b"];
 const DIRECTIONS = { front: new Vector3(0, 0, 1), left: new Vector3(1, 0, 0), head: new Vector3(0, 1, 0.001) };
 const OPACITY = 0.42;
+// Triangles from which a clear wall is drawn in one pass, half the work of two; what is lost, far before near, was not seen at 800,000.
+const ONE_PASS = 300_000;
 // Half the width and height of an angle's label, pixels.
 const TAG = [50, 20];
 // A junction is seen with this many of its graft's diameters around it: a tree has more vessels than one picture can show.
@@ -88,6 +90,8 @@ class Viewer {
     // Of two surfaces the first is solid: what shines through the second's haze is where they agree.
     const solid = kind === "side-a";
     const material = new MeshStandardMaterial({ roughness: 0.6, metalness: 0, transparent: !solid, opacity: solid ? 1 : OPACITY, side: DoubleSide, depthWrite: solid });
+    // A clear wall is drawn in two passes, its far side first; beyond this size one has to do.
+    material.forceSinglePass = (mesh.geometry.index?.count ?? 0) > 3 * ONE_PASS;
     const made = new Mesh(mesh.geometry, material);
     made.userData = { wall: true, kind, smooth: mesh.geometry };
     made.renderOrder = solid ? 0 : 2;
