@@ -129,7 +129,9 @@ fn angle_table(j: &Junction) -> AngleTable {
 
 fn branch_rows(r: &Reconstruction<'_>) -> Vec<[String; 6]> {
     let mut all: Vec<_> = r.morphometry.branches.iter().collect();
-    all.sort_by_key(|b| (b.role == Role::Other, b.id));
+    // Those of the junction that is shown before a tree's others.
+    let shown = r.main_junction().map_or(&[][..], |j| &j.branches);
+    all.sort_by_key(|b| (!shown.contains(&b.id), b.role == Role::Other, b.id));
     all.iter()
         .take(BRANCHES)
         .map(|b| {
