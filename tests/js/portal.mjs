@@ -118,10 +118,10 @@ async function begin() {
   const policy = front.headers.get("content-security-policy");
   assert.match(policy, /default-src 'none'/);
   assert.doesNotMatch(policy, /unsafe/);
-  refusals = [401];
   await page.goto(address);
   await page.locator("#sign-in").waitFor();
   await accessible("the sign-in");
+  refusals = [401];
   await signIn("vsk_00");
   await page.getByText("This API key is unknown or revoked").waitFor();
   await signIn(admin);

@@ -1,5 +1,6 @@
 //! Is it alive, is it ready, what is it: calls without a key, for monitors.
 
+use crate::config::Auth;
 use crate::db::Scope;
 use crate::error::Problem;
 use crate::state::State;
@@ -94,17 +95,20 @@ async fn metrics(Shared(state): Shared<State>) -> Result<Response, Problem> {
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response())
 }
 
-/// Name and version.
+/// Name, version, and whether callers need a key.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Version {
     name: &'static str,
     version: &'static str,
+    /// Whether the service asks for keys at all.
+    keys: bool,
 }
 
 /// Says what runs here.
 #[utoipa::path(get, path = "/version", tag = "monitoring", responses(
     (status = 200, description = "Version", body = Version)
 ))]
-async fn version() -> Json<Version> {
-    Json(Version { name: "vasculum", version: env!("CARGO_PKG_VERSION") })
+async fn version(Shared(state): Shared<State>) -> Json<Version> {
+    let keys = state.config.auth == Auth::Required;
+    Json(Version { name: "vasculum", version: env!("CARGO_PKG_VERSION"), keys })
 }

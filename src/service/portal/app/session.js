@@ -1,14 +1,18 @@
 // Signing in: at the start by a key in the address (#key=...), later by a dialog that comes whenever the session has ended,
 // over whatever the user was doing; what waited goes on afterwards.
 import { announce, h } from "./dom.js";
-import { call, json, onSignedOut } from "./net.js";
+import { call, json, onSignedOut, signedIn } from "./net.js";
 import { t } from "./text.js";
+
+// A cookie that says that there is a session, which the session's own does not tell to scripts; the browser forgets both together.
+const HINT = "signed_in=1";
 
 let asking = null;
 let known = null;
 
 async function begin(key) {
   await call("/v1/session", { method: "POST", once: true, headers: { "content-type": "application/json" }, body: JSON.stringify({ key }) });
+  document.cookie = `${HINT}; path=/; samesite=strict`;
   known = await json("/v1/session", { once: true });
 }
 
@@ -70,12 +74,16 @@ export async function startSession(texts) {
     // The key leaves the address bar and the history at once.
     history.replaceState(null, "", "#/jobs");
     await begin(given[1]).catch(() => {});
+  } else if (!document.cookie.includes(HINT) && (await json("/version")).keys) {
+    // Nobody is signed in: no call that is refused.
+    await signedIn();
   }
   return whoami();
 }
 
 export async function endSession() {
   await call("/v1/session", { method: "DELETE", once: true });
+  document.cookie = `${HINT}; path=/; samesite=strict; max-age=0`;
   known = null;
   await ask();
 }
