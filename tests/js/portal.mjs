@@ -350,17 +350,25 @@ function post(plan, files) {
 
 async function queue() {
   const files = readdirSync(join(scan, "dicom")).map((name) => [name, readFileSync(join(scan, "dicom", name))]);
-  const [first, second] = [await post({}, files), await post({}, files)];
+  // So many that the last one still waits when the page is there.
+  const sent = [];
+  for (let k = 0; k < 6; k += 1) sent.push(await post({}, files));
+  const [first, last] = [sent[0], sent.pop()];
   await open("#/jobs", "#queue tr");
-  const line = page.locator("#queue tr", { has: page.locator(`a[href="#/jobs/${second.id}"]`) });
+  const line = page.locator("#queue tr", { has: page.locator(`a[href="#/jobs/${last.id}"]`) });
   await line.getByRole("button", { name: /Raise the priority/ }).click();
-  await until("a raised priority", async () => (await read(`/v1/jobs/${second.id}`)).priority === 10);
+  await until("a raised priority", async () => (await read(`/v1/jobs/${last.id}`)).priority === 10);
   await accessible("the queue");
   await shot("queue");
   await line.getByRole("button", { name: /^Cancel/ }).click();
   await line.getByText("cancelled").waitFor();
+  for (const job of sent.slice(1)) {
+    await api(`/v1/jobs/${job.id}/cancel`, { method: "POST" });
+    await until("an ended job", async () => ["cancelled", "succeeded"].includes((await read(`/v1/jobs/${job.id}`)).state));
+    assert.equal((await api(`/v1/jobs/${job.id}`, { method: "DELETE" })).status, 204);
+  }
   await page.getByLabel("State").selectOption("succeeded");
-  // the first of the two may have ended by now
+  // the first of them may have ended by now
   const done = async () => (await read("/v1/jobs?state=succeeded")).items.length;
   await until("a filtered queue", async () => (await page.locator("#queue tr").count()) === (await done()));
   await page.getByLabel("State").selectOption("");
