@@ -8,7 +8,7 @@ use crate::land::Flat;
 use crate::web::{NONE, Web};
 use crate::{Error, TriMesh, WALL};
 use glam::DVec3;
-use space::P3;
+use space::{P3, V3};
 use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
 use std::collections::BTreeMap;
 
@@ -235,6 +235,30 @@ impl implicit::Field for Bounded<'_> {
     }
 }
 
+/// How far points inside a cap may lie off its plane, mm; caps are planar to 1e-9 mm.
+const ROUGH_MM: f64 = 1e-10;
+
+/// Move the points inside caps (face id, normal) off their planes by up to [`ROUGH_MM`]: hundreds of points in one plane to the
+/// last bit are what VTK's Delaunay tetrahedra fail on, and with them the centrelines of VMTK.
+pub(crate) fn roughen(mesh: &mut TriMesh, caps: &[(u32, V3)]) {
+    /// Of a vertex that belongs to faces of several ids.
+    const MIXED: u32 = u32::MAX;
+    let mut of: Vec<Option<u32>> = vec![None; mesh.vertices.len()];
+    for (t, &id) in mesh.triangles.iter().zip(&mesh.face_id) {
+        for &v in t {
+            let known = &mut of[v as usize];
+            *known = Some(if known.is_none_or(|other| other == id) { id } else { MIXED });
+        }
+    }
+    for &(id, normal) in caps {
+        let inner = mesh.vertices.iter_mut().zip(&of).filter(|(_, of)| **of == Some(id));
+        for (k, (x, _)) in inner.enumerate() {
+            // steps of an irrational number: no two points alike
+            *x = *x + normal * (ROUGH_MM * (2.0 * (k as f64 * 0.618_034).fract() - 1.0));
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -257,5 +281,22 @@ mod tests {
         let mut all = [0.0; 2];
         bounded.values(&[P3::new(-1.5, 5.0, 9.0), P3::new(-1.5, 5.0, 11.0)], &mut all);
         assert_eq!(all, [1.0, -0.5]);
+    }
+
+    #[test]
+    fn only_points_inside_a_cap_leave_its_plane_and_by_less_than_its_tolerance() {
+        let ring = (0..6).map(|k| f64::from(k).to_radians() * 60.0).map(|a| P3::new(a.cos(), a.sin(), 0.0));
+        let mut mesh =
+            TriMesh { vertices: ring.chain([P3::ORIGIN, P3::new(0.0, 0.0, -1.0)]).collect(), ..TriMesh::default() };
+        for k in 0..6 {
+            let (a, b) = (k, (k + 1) % 6);
+            mesh.triangles.extend([[a, b, 6], [b, a, 7]]);
+            mesh.face_id.extend([1, WALL]);
+        }
+        let before = mesh.clone();
+        roughen(&mut mesh, &[(1, V3::Z)]);
+        let off = mesh.vertices[6].z().abs();
+        assert!(off > 0.0 && off <= ROUGH_MM, "{off}");
+        assert!((0..8).filter(|&v| v != 6).all(|v| mesh.vertices[v] == before.vertices[v]));
     }
 }

@@ -71,8 +71,6 @@ const OBLIQUE: f64 = 0.5;
 const ROW: f64 = 0.866_025_403_784;
 /// Rounds of the cap's meshing; it is a plane polygon with a fixed rim.
 const CAP_ROUNDS: usize = 6;
-/// How far points inside a new cap may lie off its plane, mm; caps are planar to 1e-9 mm.
-const ROUGH_MM: f64 = 1e-10;
 /// Smallest angle up to which cap triangles are mended, degrees.
 const CAP_GOAL_DEG: f64 = 34.0;
 
@@ -372,25 +370,9 @@ fn capped(open: &TriMesh, field: &dyn Field, ducts: &[Built], ctx: &Ctx) -> Resu
     }
     polish(&mut fabric, CAP_GOAL_DEG, CAP_ROUNDS, ctx)?;
     let mut mesh = fabric.web.mesh();
-    ducts.iter().for_each(|b| roughen(&mut mesh, b));
+    let caps: Vec<(u32, V3)> = ducts.iter().map(|b| (b.duct.wanted.face_id, V3::from_raw(b.plane.normal))).collect();
+    crate::cap::roughen(&mut mesh, &caps);
     Ok(mesh)
-}
-
-/// Move the points inside a duct's cap off its plane by up to [`ROUGH_MM`]: hundreds of points in one plane to the last bit are
-/// what VTK's Delaunay tetrahedra fail on, and with them the centrelines of VMTK (wrong in 2 of 14 scans, in none with this).
-fn roughen(mesh: &mut TriMesh, b: &Built) {
-    let id = b.duct.wanted.face_id;
-    let faces = mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, of)| **of == id);
-    let mut inner: Vec<u32> = faces.flat_map(|(t, _)| *t).collect();
-    inner.sort_unstable();
-    inner.dedup();
-    let rim: std::collections::BTreeSet<u32> = b.last.iter().copied().collect();
-    for (k, &v) in inner.iter().filter(|v| !rim.contains(v)).enumerate() {
-        // steps of an irrational number: no two points alike
-        let part = 2.0 * (k as f64 * 0.618_034).fract() - 1.0;
-        let x = &mut mesh.vertices[v as usize];
-        *x = P3::from_raw(x.raw() + b.plane.normal * (ROUGH_MM * part));
-    }
 }
 
 /// The vertices that are left when the caps of some ids go, the wall's faces, and the new number of each vertex.

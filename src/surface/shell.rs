@@ -1,5 +1,6 @@
 //! The whole way from f to a finished wall: polygonise, cut, cap, remesh.
 
+use crate::cap::roughen;
 use crate::remesh::{THIN, thinned};
 use crate::{
     Bounded, Cap, Error, PolygoniseReport, PolygoniseSettings, RemeshReport, RemeshSettings, TriMesh, WALL, cut,
@@ -36,6 +37,8 @@ const MARGIN_CELLS: f64 = 4.0;
 
 /// The wall f = 0 around some of its points, cut by planes ([`cut`]), capped and remeshed ([`crate::remesh`]).
 ///
+/// Rims lie in their planes to 1e-12 mm, points inside caps to 1e-10 mm, by intention not better.
+///
 /// Outside the planes f is not trusted: the field is closed there ([`Bounded`]). Of 402 meshes of random vessels one cell
 /// for all leaves three without an answer, halving it there none.
 ///
@@ -53,7 +56,8 @@ pub fn shell(
     let by = |cell: &PolygoniseSettings, halvings: i32| {
         let (closed, caps, polygonised) = closed((field, &bounded), seeds, cuts, cell, &ctx.part(0.0, 0.3))?;
         let thin = if halvings > 0 { THIN_HALVED } else { THIN };
-        let (mesh, remeshed) = thinned(&closed, field, cuts, settings, thin, &ctx.part(0.3, 1.0))?;
+        let (mut mesh, remeshed) = thinned(&closed, field, cuts, settings, thin, &ctx.part(0.3, 1.0))?;
+        roughen(&mut mesh, &caps.iter().map(|c| (c.face_id, c.plane.outward)).collect::<Vec<_>>());
         Ok(Shell { mesh, caps, halvings, polygonised, remeshed })
     };
     halving(cell, by)

@@ -356,7 +356,7 @@ async function queue() {
   const [first, last] = [sent[0], sent.pop()];
   await open("#/jobs", "#queue tr");
   const line = page.locator("#queue tr", { has: page.locator(`a[href="#/jobs/${last.id}"]`) });
-  await line.getByRole("button", { name: /Raise the priority/ }).click();
+  await line.getByRole("button", { name: /Raise the priority/ }).click({ timeout: LONG });
   await until("a raised priority", async () => (await read(`/v1/jobs/${last.id}`)).priority === 10);
   await accessible("the queue");
   await shot("queue");
