@@ -254,7 +254,7 @@ pub(crate) fn roughen(mesh: &mut TriMesh, caps: &[(u32, V3)]) {
         let inner = mesh.vertices.iter_mut().zip(&of).filter(|(_, of)| **of == Some(id));
         for (k, (x, _)) in inner.enumerate() {
             // steps of an irrational number: no two points alike
-            *x = *x + normal * (ROUGH_MM * (2.0 * (k as f64 * 0.618_034).fract() - 1.0));
+            *x += normal * (ROUGH_MM * (2.0 * (k as f64 * 0.618_034).fract() - 1.0));
         }
     }
 }
