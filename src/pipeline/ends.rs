@@ -17,7 +17,7 @@ const SAMPLES: usize = 17;
 /// Rays of a section.
 const RAYS: usize = 48;
 /// A section may be this many times as wide as its inscribed circle; beyond, it runs into another vessel.
-const WIDE: f64 = 1.8;
+pub(crate) const WIDE: f64 = 1.8;
 /// How far past its plane a cut closes the lumen, pixels; twice what `Bounded` leaves standing.
 const CLOSED_PX: f64 = 8.0;
 

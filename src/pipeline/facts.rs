@@ -104,20 +104,20 @@ fn volume_change(wall: &Wall) -> f64 {
 /// or by its own where no branch ends.
 fn caps(wall: &Wall, ends: (&Planes, &Openings), graph: &MedialGraph, morphometry: &Morphometry) -> Vec<CapFacts> {
     let branch = |c: &surface::Cap| {
-        let face = wall.beside.iter().find(|b| b[0] == c.face_id).map_or(c.face_id, |b| b[1]);
+        let face = wall.ends.end_of(c.face_id);
         let node = graph.nodes.iter().position(|n| n.cap == Some(face))?;
         morphometry.branches.iter().find(|b| b.from_node == node || b.to_node == node).map(|b| (b.role, b.id))
     };
-    let branches: Vec<Option<(Role, usize)>> = wall.caps.iter().map(branch).collect();
+    let branches: Vec<Option<(Role, usize)>> = wall.ends.caps.iter().map(branch).collect();
     let count = |wanted: &dyn Fn((Role, usize)) -> bool| branches.iter().flatten().filter(|b| wanted(**b)).count();
     let name = |i: usize| match branches[i] {
         Some((role, _)) if role != Role::Other && count(&|b| b.0 == role) == 1 => format!("end_{}", role.name()),
         Some((_, id)) if count(&|b| b.1 == id) == 1 => format!("end_branch_{id}"),
-        Some((_, id)) => format!("end_branch_{id}_cap_{}", wall.caps[i].face_id),
-        None => format!("end_{}", wall.caps[i].face_id),
+        Some((_, id)) => format!("end_branch_{id}_cap_{}", wall.ends.caps[i].face_id),
+        None => format!("end_{}", wall.ends.caps[i].face_id),
     };
-    let boundary = boundaries(&wall.caps, &branches);
-    let crossing: Vec<_> = wall.caps.iter().map(|c| crossing(c, graph, ends)).collect();
+    let boundary = boundaries(&wall.ends.caps, &branches);
+    let crossing: Vec<_> = wall.ends.caps.iter().map(|c| crossing(c, graph, ends)).collect();
     let fact = |(i, c): (usize, &surface::Cap)| CapFacts {
         oblique_deg: crossing[i].map(|c| c.0),
         set_back_mm: crossing[i].map(|c| c.1),
@@ -128,7 +128,7 @@ fn caps(wall: &Wall, ends: (&Planes, &Openings), graph: &MedialGraph, morphometr
         normal: c.plane.outward,
         area_mm2: c.area_mm2,
     };
-    wall.caps.iter().enumerate().map(fact).collect()
+    wall.ends.caps.iter().enumerate().map(fact).collect()
 }
 
 /// Caps whose area is within this part of the largest count as equally wide: noise must not swap their names.

@@ -4,7 +4,7 @@
 //! so it is squared: cut across its medial line at the first place whose section lies in the data whole. Nothing that can
 //! be measured is lost, for the sections farther out are open.
 
-use crate::ends::{Ends, along, line, outline};
+use crate::ends::{Ends, WIDE, along, line, outline};
 use crate::mesh_fault::MeshFault;
 use crate::wall::Wall;
 use imaging::CutPlane;
@@ -22,16 +22,15 @@ const SQUARE_DEG: f64 = 5.0;
 const MARGIN_PX: f64 = 1.0;
 /// Steps along a medial line in search of a whole section, pixels.
 const STEP_PX: f64 = 0.25;
-/// A section this many times as wide as its inscribed circle runs into another vessel.
-const WIDE: f64 = 1.8;
 /// Ends that are set back by more than so many diameters are told.
 const FAR_DIAMETERS: f64 = 2.0;
 
-/// Where the planes cut the unsmoothed wall.
+/// Where planes cut a wall.
 pub(crate) struct Openings {
+    /// By face id.
     pub(crate) caps: Vec<Cap>,
     /// Caps (face ids) that share a corner of the volume with a larger one: the same vessel ends at both.
-    pub(crate) beside: Vec<[u32; 2]>,
+    beside: Vec<[u32; 2]>,
 }
 
 impl Openings {
@@ -42,22 +41,18 @@ impl Openings {
 
     /// One hint for each place where a vessel ends.
     pub(crate) fn hints(&self) -> Vec<CapHint> {
-        hints(&self.caps, &self.beside)
+        let ends = self.caps.iter().filter(|c| self.end_of(c.face_id) == c.face_id);
+        ends.map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward }).collect()
+    }
+
+    /// The cap at which the vessel of a cap ends.
+    pub(crate) fn end_of(&self, face_id: u32) -> u32 {
+        self.beside.iter().find(|b| b[0] == face_id).map_or(face_id, |b| b[1])
     }
 
     fn cap(&self, face_id: u32) -> Option<&Cap> {
         self.caps.iter().find(|c| c.face_id == face_id)
     }
-
-    /// The cap at which the vessel of a cap ends.
-    fn end_of(&self, face_id: u32) -> u32 {
-        self.beside.iter().find(|b| b[0] == face_id).map_or(face_id, |b| b[1])
-    }
-}
-
-fn hints(caps: &[Cap], beside: &[[u32; 2]]) -> Vec<CapHint> {
-    let ends = caps.iter().filter(|c| beside.iter().all(|&[small, _]| small != c.face_id));
-    ends.map(|c| CapHint { face_id: c.face_id, centroid: c.centroid, normal: c.plane.outward }).collect()
 }
 
 /// A found end that was squared.
@@ -252,7 +247,7 @@ impl Way<'_> {
 }
 
 /// The finished wall's caps and the medial lines brought together: lines end where the wall does, and each end names its
-/// cap. Gives what each cap was found by.
+/// cap. Gives warnings of the lines at whose ends the smoothed wall has none.
 ///
 /// # Errors
 /// [`MeshFault::Skeleton`] of a cap without an end.
@@ -262,11 +257,8 @@ pub(crate) fn settle(
     (planes, openings): (&Planes, &Openings),
     field: &Sampled,
 ) -> Result<Vec<Warning>, MeshFault> {
-    let hints = hints(&wall.caps, &wall.beside);
-    let of = |face_id: u32| {
-        let cap = wall.caps.iter().find(|c| c.face_id == face_id)?;
-        planes.opening_of(cap, openings).map(|id| openings.end_of(id))
-    };
+    let hints = wall.ends.hints();
+    let of = |face_id: u32| planes.opening_of(wall.ends.cap(face_id)?, openings).map(|id| openings.end_of(id));
     let ends: Vec<Option<u32>> = hints.iter().map(|h| of(h.face_id)).collect();
     let mut lost = Vec::new();
     for (n, node) in graph.nodes.iter_mut().enumerate().filter(|(_, n)| n.cap.is_some()) {
@@ -294,7 +286,7 @@ pub(crate) fn crossing(cap: &Cap, graph: &MedialGraph, (planes, openings): (&Pla
 
 /// Caps that share a rim vertex with a larger one, with the largest such: a vessel that leaves the volume across an edge
 /// of it is cut by two planes, and has one end.
-pub(crate) fn beside(mesh: &TriMesh, caps: &[Cap]) -> Vec<[u32; 2]> {
+fn beside(mesh: &TriMesh, caps: &[Cap]) -> Vec<[u32; 2]> {
     let mut at: Vec<Vec<u32>> = vec![Vec::new(); mesh.vertices.len()];
     for (t, &id) in mesh.triangles.iter().zip(&mesh.face_id).filter(|(_, id)| **id != surface::WALL) {
         t.iter().for_each(|&v| at[v as usize].push(id));

@@ -1,7 +1,7 @@
 //! The wall of the lumen: f as a 3D image, smoothed within the plan's bound, cut where the data end, meshed, measured.
 
 use crate::mesh_fault::MeshFault;
-use crate::openings::{Openings, Planes, beside};
+use crate::openings::{Openings, Planes};
 use artefact::plan::Plan;
 use exec::Ctx;
 use imaging::Contours;
@@ -14,9 +14,7 @@ use surface::{
 /// The surface with all that is known of it.
 pub(crate) struct Wall {
     pub(crate) mesh: TriMesh,
-    pub(crate) caps: Vec<surface::Cap>,
-    /// Caps (face ids) that share a corner of the volume with a larger one: the same vessel ends at both.
-    pub(crate) beside: Vec<[u32; 2]>,
+    pub(crate) ends: Openings,
     pub(crate) topology: Topology,
     pub(crate) quality: Quality,
     pub(crate) displacement: Displacement,
@@ -197,9 +195,9 @@ fn measured(shell: Shell, field: Sampled, hausdorff_mm: f64, plan: &Plan, ctx: &
     let patches = surface::patches(&mesh, &ids, ctx)?;
     let (extended, mut warnings) = extended(&mesh, &field, caps.len() as u32, plan, ctx)?;
     warnings.extend(missed_tolerance(&quality, plan));
-    let beside = beside(&mesh, &caps);
+    let ends = Openings::new(&mesh, caps);
     let field = plan.outputs.iter().any(|o| o == "patches").then_some(field);
-    Ok(Wall { mesh, caps, beside, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
+    Ok(Wall { mesh, ends, topology, quality, displacement, hausdorff_mm, patches, extended, warnings, field })
 }
 
 /// Where triangles stand farther off the wall than the plan allows: its shortest edge forbids shorter ones there.

@@ -127,6 +127,6 @@ def test_faults():
 
 
 if __name__ == "__main__":
-    for test in (test_names, test_cut, test_faults):
+    for test in (test_names, test_across, test_cut, test_faults):
         test()
-    print("ends keep their names, cuts lie where they were asked for, and others are refused with their place")
+    print("ends keep their names and lie across their vessels, cuts lie where they were asked for, and others are refused with their place")

@@ -149,7 +149,7 @@ class Trouble(http.server.BaseHTTPRequestHandler):
     target = rate = 0
     faults = {"500": 0, "503": 0, "closed": 0, "silent": 0}
     # Requests that will find nobody who answers, and what lets them go.
-    silent = silenced = 0
+    silent = 0
     over = threading.Event()
 
     def pass_on(self):
@@ -161,7 +161,6 @@ class Trouble(http.server.BaseHTTPRequestHandler):
                 self.faults[fault] += 1
             is_silent = Trouble.silent > 0 or fault == "silent"
             Trouble.silent -= Trouble.silent > 0
-            Trouble.silenced += is_silent
         if is_silent:
             self.over.wait(120)
             self.close_connection = True

@@ -2,29 +2,26 @@
 //!
 //! The fixed cost of a write on PostgreSQL (messages, planning, triggers, the commit) is many times that of a further row in
 //! the same statement. So while as many groups as there may be are under way, further callers wait together, and the next group takes
-//! up to [`MOST`] of them. A lonely caller waits for nobody, and everybody hears after the commit of its own group.
+//! up to [`super::MOST`] of them. A lonely caller waits for nobody, and everybody hears after the commit of its own group.
 //!
 //! A group runs as a task of its own: a caller that goes away takes nobody with it. Where the database refuses a group
 //! (a constraint, a deadlock), each of its callers is asked for alone, so that one bad call fails by itself.
 
-use super::MOST;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
-
-/// What is waited for: a call, and where its answer goes.
-type Waiting<A, R> = Vec<(A, oneshot::Sender<sqlx::Result<R>>)>;
+use super::line::{Line, Waiting};
+use std::sync::Arc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 /// Callers that wait for their writes.
 #[derive(Debug)]
 pub(crate) struct Grouped<A, R> {
-    waiting: Mutex<Waiting<A, R>>,
+    line: Line<A, sqlx::Result<R>>,
     turns: Arc<Semaphore>,
 }
 
 impl<A, R> Grouped<A, R> {
     /// For so many groups at the same time.
     pub(crate) fn new(groups: usize) -> Self {
-        Self { waiting: Mutex::default(), turns: Arc::new(Semaphore::new(groups)) }
+        Self { line: Line::default(), turns: Arc::new(Semaphore::new(groups)) }
     }
 }
 
@@ -43,15 +40,14 @@ impl<A: Clone + Send + 'static, R: Send + 'static> Grouped<A, R> {
     where
         F: Future<Output = sqlx::Result<Vec<R>>> + Send + 'static,
     {
-        let (sender, mut answer) = oneshot::channel();
-        self.lock().push((call, sender));
+        let mut answer = self.line.join(call);
         let told = loop {
             let turn = tokio::select! {
                 biased;
                 told = &mut answer => break told,
                 turn = Arc::clone(&self.turns).acquire_owned() => turn.map_err(|_| sqlx::Error::PoolClosed)?,
             };
-            let group = self.group(&alike);
+            let group = self.line.take(&alike);
             if group.is_empty() {
                 // Ours is under way with another group.
                 drop(turn);
@@ -64,7 +60,7 @@ impl<A: Clone + Send + 'static, R: Send + 'static> Grouped<A, R> {
 
     async fn answer<F>(
         self: Arc<Self>,
-        group: Waiting<A, R>,
+        group: Waiting<A, sqlx::Result<R>>,
         write: impl Fn(Vec<A>) -> F + Send + Sync,
         turn: OwnedSemaphorePermit,
     ) where
@@ -82,7 +78,7 @@ impl<A: Clone + Send + 'static, R: Send + 'static> Grouped<A, R> {
             Err(error) => {
                 if super::is_away(&error) {
                     // Those who wait would find the same out, one group after the other.
-                    for (_, sender) in std::mem::take(&mut *self.lock()) {
+                    for (_, sender) in self.line.take_all() {
                         let _ = sender.send(Err(super::copy(&error)));
                     }
                 }
@@ -97,26 +93,6 @@ impl<A: Clone + Send + 'static, R: Send + 'static> Grouped<A, R> {
             let _ = sender.send(answers.next().unwrap_or_else(|| Err(unanswered())));
         }
     }
-
-    /// The first that waits and those like it; those whose caller went away are dropped.
-    fn group(&self, alike: impl Fn(&A, &A) -> bool) -> Waiting<A, R> {
-        let mut waiting = self.lock();
-        waiting.retain(|(_, sender)| !sender.is_closed());
-        let Some(first) = waiting.first().map(|(call, _)| call.clone()) else { return Vec::new() };
-        let mut left = MOST;
-        waiting
-            .extract_if(.., |(call, _)| {
-                let taken = left > 0 && alike(&first, call);
-                left -= usize::from(taken);
-                taken
-            })
-            .collect()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Waiting<A, R>> {
-        // Calls and senders are whole or not there.
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 fn unanswered() -> sqlx::Error {
@@ -125,6 +101,7 @@ fn unanswered() -> sqlx::Error {
 
 #[cfg(test)]
 mod tests {
+    use super::super::MOST;
     use super::*;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::time::Duration;

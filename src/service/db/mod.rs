@@ -9,6 +9,7 @@
 //! clock is ever compared, never a node's.
 
 mod grouped;
+mod line;
 mod postgres;
 mod sizes;
 mod sqlite;
@@ -17,8 +18,9 @@ mod together;
 mod value;
 
 pub(crate) use grouped::Grouped;
+pub(crate) use line::MOST;
 pub(crate) use sizes::{Sizes, placeholders};
-pub(crate) use together::{MOST, Together};
+pub(crate) use together::Together;
 pub(crate) use value::args;
 pub use value::{Row, Tx, Value};
 

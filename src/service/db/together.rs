@@ -5,28 +5,23 @@
 //! wait together, and the first whose turn comes asks for all of them. A lonely caller waits for nobody. What a caller
 //! gets was read after it asked, so nobody sees anything older than without this.
 
+use super::line::Line;
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::Semaphore;
 
-/// Most rows of one statement: its arguments are written out.
-pub(crate) const MOST: usize = 32;
 /// Statements at the same time; more would only make each smaller.
 const BATCHES: usize = 2;
-
-/// What is waited for: a key, and where its row goes.
-type Waiting<K, V> = Vec<(K, oneshot::Sender<Option<V>>)>;
 
 /// Callers that wait for rows by their keys.
 #[derive(Debug)]
 pub(crate) struct Together<K, V> {
-    waiting: Mutex<Waiting<K, V>>,
+    line: Line<K, Option<V>>,
     turns: Semaphore,
 }
 
 impl<K, V> Default for Together<K, V> {
     fn default() -> Self {
-        Self { waiting: Mutex::default(), turns: Semaphore::new(BATCHES) }
+        Self { line: Line::default(), turns: Semaphore::new(BATCHES) }
     }
 }
 
@@ -44,15 +39,14 @@ impl<K: Ord + Clone, V: Clone> Together<K, V> {
     where
         F: Future<Output = sqlx::Result<BTreeMap<K, V>>>,
     {
-        let (sender, mut answer) = oneshot::channel();
-        self.lock().push((key.clone(), sender));
+        let mut answer = self.line.join(key.clone());
         let told = loop {
             let turn = tokio::select! {
                 biased;
                 told = &mut answer => break told,
                 turn = self.turns.acquire() => turn.map_err(|_| sqlx::Error::PoolClosed)?,
             };
-            let batch = self.batch(&alike);
+            let batch = self.line.take(&alike);
             if batch.is_empty() {
                 // Ours is under way with another batch: taking turns on and on would only keep a processor busy.
                 drop(turn);
@@ -73,29 +67,11 @@ impl<K: Ord + Clone, V: Clone> Together<K, V> {
             Err(_) => Ok(read(vec![key.clone()]).await?.remove(&key)),
         }
     }
-
-    /// The first that waits and those like it.
-    fn batch(&self, alike: impl Fn(&K, &K) -> bool) -> Waiting<K, V> {
-        let mut waiting = self.lock();
-        let Some(first) = waiting.first().map(|(key, _)| key.clone()) else { return Vec::new() };
-        let mut left = MOST;
-        waiting
-            .extract_if(.., |(key, _)| {
-                let taken = left > 0 && alike(&first, key);
-                left -= usize::from(taken);
-                taken
-            })
-            .collect()
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Waiting<K, V>> {
-        // Keys and senders are whole or not there.
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::MOST;
     use super::*;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::time::Duration;
