@@ -15,6 +15,14 @@ const STEPS: &[(&str, &str)] = &[
     ("implicit.", "give a stack that the vessel crosses in more slices, or set a seed on the vessel"),
     ("fit.", "leave out slices whose contours are wrong (segmentation.exclude_slices)"),
     (
+        "surface.too_many_triangles",
+        "ask for longer edges (surface.edge_mm) or a larger surface.max_error_mm in the plan",
+    ),
+    (
+        "surface.too_many_cells",
+        "ask for longer edges (surface.edge_mm), or leave out what is not the vessel (segmentation.region)",
+    ),
+    (
         "surface.",
         "look at the contours there: vessels that touch, a wrong slice; leave it out, set a seed, or cut (ends.cut_mm)",
     ),
@@ -39,6 +47,7 @@ mod tests {
         assert!(next_step("input.unreadable").is_some_and(|s| s.contains("path")));
         assert!(next_step("input.empty").is_some_and(|s| s.contains("validate")));
         assert!(next_step("segmentation.no_vessel").is_some_and(|s| s.contains("seeds_mm")));
+        assert!(next_step("surface.too_many_triangles").is_some_and(|s| s.contains("edge_mm")));
         assert_eq!(next_step("internal"), None);
         assert_eq!(next_step("inputs"), None);
     }

@@ -38,7 +38,7 @@ pub struct RemeshSettings {
     pub sizing: Sizing,
     /// Smallest angle up to which single triangles are mended, degrees. Default 36.
     pub goal_angle_deg: f64,
-    /// Most triangles. Default 2 million.
+    /// Most triangles. Default 4 million (a wall of half as many while its edges are split).
     pub max_triangles: usize,
 }
 
@@ -50,7 +50,7 @@ impl Default for RemeshSettings {
             iterations: 6,
             sizing: Sizing::Curvature,
             goal_angle_deg: 36.0,
-            max_triangles: 2_000_000,
+            max_triangles: 4_000_000,
         }
     }
 }

@@ -348,6 +348,15 @@ function post(plan, files) {
   return api("/v1/jobs", { method: "POST", body: form }).then((r) => r.json());
 }
 
+// Rows that change at every poll keep their buttons: a press that outlasts a poll counts.
+async function pressLong(button) {
+  const box = await button.boundingBox();
+  await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+  await page.mouse.down();
+  await page.waitForTimeout(1500);
+  await page.mouse.up();
+}
+
 async function queue() {
   const files = readdirSync(join(scan, "dicom")).map((name) => [name, readFileSync(join(scan, "dicom", name))]);
   // So many that the last one still waits when the page is there.
@@ -360,7 +369,7 @@ async function queue() {
   await until("a raised priority", async () => (await read(`/v1/jobs/${last.id}`)).priority === 10);
   await accessible("the queue");
   await shot("queue");
-  await line.getByRole("button", { name: /^Cancel/ }).click();
+  await pressLong(line.getByRole("button", { name: /^Cancel/ }));
   await line.getByText("cancelled").waitFor();
   for (const job of sent.slice(1)) {
     await api(`/v1/jobs/${job.id}/cancel`, { method: "POST" });
@@ -398,7 +407,10 @@ async function mendFailed() {
   const noise = () => (state = (state * 48271) % 2147483647) % 20;
   const slices = Array.from({ length: 6 }, (_, k) => [`s${k}.pgm`, Buffer.concat([Buffer.from("P5 64 64 255\n"), Buffer.from(Array.from({ length: 4096 }, () => 90 + noise()))])]);
   const job = await post({ geometry: { pixel_spacing_mm: [0.5, 0.5], slice_spacing_mm: 2 } }, slices);
-  await until("a failed job", async () => (await read(`/v1/jobs/${job.id}`)).state === "failed");
+  const ended = await until("a failed job", async () => {
+    const now = await read(`/v1/jobs/${job.id}`);
+    return now.state === "failed" && now;
+  });
   await open(`#/jobs/${job.id}`, ".fault");
   await page.getByText("segmentation.no_vessel").first().waitFor();
   await page.getByText("What to do").first().waitFor();
@@ -406,6 +418,12 @@ async function mendFailed() {
   await page.locator(".check-picture canvas").waitFor({ timeout: LONG });
   await accessible("a failed job");
   await shot("failed");
+  await open("#/jobs?state=failed", "#queue tr");
+  await page.getByRole("button", { name: /^Try again/ }).click();
+  await until("a second try that failed too", async () => {
+    const now = await read(`/v1/jobs/${job.id}`);
+    return now.state === "failed" && now.started_at > ended.started_at;
+  });
 }
 
 // Plain images say what they lack, and are understood once it is given.

@@ -24,6 +24,8 @@ pub(crate) enum What {
     Service,
     /// Jobs per second of the queue on SQLite and PostgreSQL, with few and with many queued, and beside a queue library.
     Queue,
+    /// From a result's address to its drawn wall in a browser without a GPU, and the heap over 50 results.
+    Portal,
 }
 
 /// Thin the same volumes with our code, gaara and scikit-image, interleaved, and show medians and ratios.
@@ -69,6 +71,20 @@ pub(crate) fn service(binary: &Path) -> Result<()> {
     let mut bench = shell::command(tools::python()?);
     bench.arg(shell::root()?.join("tests/bench/service.py")).args(["10", "500"]);
     bench.env("VASCULUM_ROOT", shell::root()?).env("VASCULUM_BIN", binary);
+    shell::run(bench)
+}
+
+/// The first paint of walls of two sizes in headless Chromium, `visits` times each, and the page's heap.
+pub(crate) fn portal(visits: usize) -> Result<()> {
+    ensure!(visits > 0, "at least one visit");
+    let binary = tools::release_binary()?;
+    tools::browser()?;
+    let packages = tools::node_packages()?;
+    // modules resolve packages from their own folder: run a copy beside node_modules
+    let copy = packages.join("bench-portal.mjs");
+    fs::copy(shell::root()?.join("tests/bench/portal.mjs"), &copy)?;
+    let mut bench = shell::command("node");
+    bench.arg(copy).arg(binary).arg(tools::target()?.join("bench-portal")).arg(visits.to_string());
     shell::run(bench)
 }
 

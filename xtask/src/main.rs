@@ -76,7 +76,7 @@ enum Command {
         /// What is measured.
         #[arg(value_enum, default_value_t = bench::What::Whole)]
         what: bench::What,
-        /// Repetitions (of `accuracy`: seeds of each resolution); the medians are shown.
+        /// Repetitions (of `accuracy`: seeds of each resolution, of `portal`: visits); the medians are shown.
         #[arg(long, default_value_t = 5)]
         repeat: usize,
         /// Jobs queued in the large case of `queue`.
@@ -112,6 +112,7 @@ fn run(command: Command) -> Result<()> {
         Command::Bench { what: bench::What::Surface, .. } => bench::surface(),
         Command::Bench { what: bench::What::Accuracy, repeat, .. } => bench::accuracy(repeat),
         Command::Bench { what: bench::What::Service, .. } => bench::service(&tools::release_binary()?),
+        Command::Bench { what: bench::What::Portal, repeat, .. } => bench::portal(repeat),
         Command::Bench { what: bench::What::Queue, large, .. } => storm::bench(large),
         Command::Storm { kills, jobs, seed } => storm::run(kills, jobs, seed),
     }

@@ -96,6 +96,30 @@ export function redraw(box, content, make) {
   if (focused) box.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
 }
 
+const rowTexts = new WeakMap();
+
+// Rows of a table body by key. Of a row that changed only the cells that look different are replaced, and rows that stay are not
+// moved: a press on a button counts when it went down and came up on the same one.
+export function redrawRows(body, items, keyOf, make) {
+  const focused = document.activeElement?.dataset?.key;
+  const had = new Map([...body.children].map((row) => [row.dataset.row, row]));
+  const rows = items.map((item) => {
+    const [key, text] = [keyOf(item), JSON.stringify(item)];
+    const row = had.get(key);
+    had.delete(key);
+    if (row && rowTexts.get(row) === text) return row;
+    const fresh = make(item);
+    const kept = row ?? fresh;
+    if (row) [...fresh.children].forEach((cell, i) => { if (!cell.isEqualNode(row.children[i])) row.children[i].replaceWith(cell); });
+    kept.dataset.row = key;
+    rowTexts.set(kept, text);
+    return kept;
+  });
+  for (const gone of had.values()) gone.remove();
+  rows.forEach((row, i) => { if (body.children[i] !== row) body.insertBefore(row, body.children[i] ?? null); });
+  if (focused && document.activeElement?.dataset?.key !== focused) body.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
+}
+
 // Hands a text to the browser as a file.
 export function download(name, text, type) {
   const address = URL.createObjectURL(new Blob([text], { type }));

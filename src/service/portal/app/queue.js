@@ -1,5 +1,5 @@
 // The jobs, live: filtered, sorted, cancelled, run again, moved; and what the machine has left.
-import { button, card, field, h, redraw, select } from "./dom.js";
+import { button, card, field, h, redraw, redrawRows, select } from "./dom.js";
 import { recovered, notice } from "./faults.js";
 import { call, filePath, jobPath, json, pause } from "./net.js";
 import { setQuery } from "./router.js";
@@ -90,8 +90,8 @@ function draw(view, parts, changed) {
   const order = (a, b) => (column.of(a) < column.of(b) ? -1 : column.of(a) > column.of(b) ? 1 : a.id < b.id ? -1 : 1);
   items.sort((a, b) => (view.down ? order(b, a) : order(a, b)));
   redraw(parts.head, [view.sort, view.down], () => [h("th", { scope: "col" }, t("queue.job")), ...COLUMNS.map((c) => heading(c, view, changed)), h("th", { scope: "col" }, t("queue.actions"))]);
-  // Rows are drawn anew only when they changed; times tick in place.
-  redraw(parts.rows, items, () => items.map(row));
+  redrawRows(parts.rows, items, (job) => job.id, row);
+  // Times tick in place.
   for (const cell of parts.rows.querySelectorAll("[data-tick]")) {
     const job = items.find((j) => j.id === cell.dataset.job);
     if (job) cell.textContent = duration(cell.dataset.tick === "waited" ? waited(job) : ran(job));

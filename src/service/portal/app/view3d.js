@@ -48,6 +48,7 @@ class Viewer {
     this.controls = new OrbitControls(this.camera, this.canvas);
     this.controls.addEventListener("change", () => this.draw());
     this.listen();
+    this.fit();
   }
 
   listen() {
@@ -283,7 +284,8 @@ class Viewer {
 
   fit() {
     const { clientWidth: width, clientHeight: height } = this.box;
-    if (width === 0 || height === 0) return;
+    if (width === 0 || height === 0 || (width === this.width && height === this.height)) return;
+    Object.assign(this, { width, height });
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
@@ -350,7 +352,8 @@ function shaped(smooth) {
 // parts: [{bytes of surface.glb, kind}]; kind names a colour where several surfaces lie over one another.
 export async function open(box, parts, options) {
   const viewer = new Viewer(box, options);
+  // Not drawn here: the frame that `look` asked for shows the wall with the angles, which come in the same turn. A million
+  // triangles take more than half a second without a GPU.
   await viewer.load(parts);
-  viewer.fit();
   return viewer;
 }
