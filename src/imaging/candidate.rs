@@ -211,12 +211,16 @@ const UNIT_MM: f64 = 0.05;
 /// The 26-neighbours of each voxel within a component, with step lengths in [`UNIT_MM`].
 struct Links {
     /// Where each voxel's neighbours begin, and their end.
-    first: Vec<usize>,
-    /// Neighbour and step.
-    steps: Vec<(u32, u32)>,
-    /// The longest step.
-    longest: u32,
+    first: Vec<u32>,
+    /// Neighbour, and in the low [`KIND_BITS`] bits the number of its step's length: half the memory of two numbers, and these
+    /// lists are what the search for the vessel reads most.
+    steps: Vec<u32>,
+    /// Step lengths by number.
+    lengths: Vec<u32>,
 }
+
+/// A box has seven directions up to sign and order, hence at most seven step lengths.
+const KIND_BITS: u32 = 3;
 
 impl Links {
     fn new(v: &Volume, voxels: &[u32], slots: &[u32]) -> Self {
@@ -224,26 +228,36 @@ impl Links {
             let l = (0..3).map(|a| (f64::from(d[a]) * v.step[a]).powi(2)).sum::<f64>().sqrt();
             (l / UNIT_MM).round().max(1.0) as u32
         });
+        let mut lengths = weight.to_vec();
+        lengths.sort_unstable();
+        lengths.dedup();
+        let kind = weight.map(|w| lengths.iter().position(|&l| l == w).unwrap_or(0) as u32);
         let around = Around::new(v.n);
         let (mut first, mut steps) = (Vec::with_capacity(voxels.len() + 1), Vec::with_capacity(16 * voxels.len()));
         for &i in voxels {
-            first.push(steps.len());
+            first.push(steps.len() as u32);
             around.visit(i as usize, |k, j| {
                 if slots[j] != u32::MAX {
-                    steps.push((slots[j], weight[k]));
+                    steps.push(slots[j] << KIND_BITS | kind[k]);
                 }
             });
         }
-        first.push(steps.len());
-        Self { first, steps, longest: weight.into_iter().max().unwrap_or(1) }
+        first.push(steps.len() as u32);
+        Self { first, steps, lengths }
     }
 
     fn len(&self) -> usize {
         self.first.len() - 1
     }
 
-    fn of(&self, i: u32) -> &[(u32, u32)] {
-        &self.steps[self.first[i as usize]..self.first[i as usize + 1]]
+    /// Neighbours of a voxel, with the lengths of the steps there.
+    fn of(&self, i: u32) -> impl Iterator<Item = (u32, u32)> {
+        let steps = &self.steps[self.first[i as usize] as usize..self.first[i as usize + 1] as usize];
+        steps.iter().map(|s| (s >> KIND_BITS, self.lengths[(s & ((1 << KIND_BITS) - 1)) as usize]))
+    }
+
+    fn longest(&self) -> usize {
+        self.lengths.last().map_or(1, |&l| l as usize)
     }
 }
 
@@ -251,7 +265,7 @@ impl Links {
 /// takes the place of a heap: Dial 1969).
 fn geodesic(links: &Links, root: usize) -> Vec<u32> {
     let mut d = vec![u32::MAX; links.len()];
-    let mut ring = vec![Vec::new(); links.longest as usize + 1];
+    let mut ring = vec![Vec::new(); links.longest() + 1];
     let (mut here, mut waiting, mut at) = (vec![root as u32], 1, 0_u32);
     d[root] = 0;
     while waiting > 0 {
@@ -261,16 +275,18 @@ fn geodesic(links: &Links, root: usize) -> Vec<u32> {
             if d[i as usize] < at {
                 continue;
             }
-            for &(j, w) in links.of(i) {
+            for (j, w) in links.of(i) {
                 if d[j as usize] > at + w {
                     d[j as usize] = at + w;
-                    ring[(at + w) as usize % (links.longest as usize + 1)].push(j);
+                    let then = (at + w) as usize % ring.len();
+                    ring[then].push(j);
                     waiting += 1;
                 }
             }
         }
         at += 1;
-        std::mem::swap(&mut here, &mut ring[at as usize % (links.longest as usize + 1)]);
+        let next = at as usize % ring.len();
+        std::mem::swap(&mut here, &mut ring[next]);
     }
     d
 }
@@ -290,7 +306,7 @@ fn persistence(links: &Links, d: &[u32]) -> Vec<u32> {
     }
     for i in order {
         parent[i as usize] = i;
-        for &(j, _) in links.of(i) {
+        for (j, _) in links.of(i) {
             if parent[j as usize] == u32::MAX {
                 continue;
             }
