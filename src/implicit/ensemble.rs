@@ -31,9 +31,8 @@ const HARMONICS: usize = 16;
 const WAVES: usize = 256;
 /// Plane waves of a draw of the levels' errors.
 const LEVEL_WAVES: usize = 128;
-/// Standard error of the half-maximum correction, as a share of it: what it leaves of straight tubes without noise, turned by
-/// 0 to 60 degrees against slices of 1.5 and 3 mm, is 3 to 12 % of it, and of the branches of the demo scan up to 20 %
-/// (docs/adr/0037).
+/// Standard error of the half-maximum correction, as a share of it: what it leaves of the branches of the demo scan without noise is 1
+/// to 17 % of it (docs/adr/0038).
 const CORRECTION_ERROR: f64 = 0.15;
 /// Smallest wave number, in scaled coordinates (the farthest constraint at distance 1): what is longer is as good as a
 /// polynomial of second degree, which the constraints determine.
