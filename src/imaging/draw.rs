@@ -106,8 +106,13 @@ pub(crate) fn planes(stack: &Stack, axis: Axis) -> Vec<Plane> {
 }
 
 /// Another axis is taken only when the mean squared normal component along it is below this share of the slices' one:
-/// slices carry square, unresampled pixels. A vessel turned by 45 degrees keeps its slices, one by 60 (share .33) not.
+/// slices carry square, unresampled pixels. A vessel turned by 45 degrees keeps its slices.
 const CLEARLY_BETTER: f64 = 0.6;
+/// Where slices lie farther apart than this many pixels ...
+const APART_PX: f64 = 1.75;
+/// ... another axis is taken only by what lies within the slices, and spans no more than this many of its diameters across them: up to
+/// 85 degrees its sections across the columns err by half as much again, or twice as much, as those of the slices (docs/adr/0030).
+const WITHIN_DIAMETERS: f64 = 2.5;
 /// ... and less where the slices are so far apart that a plane across them shows a lumen by few samples: the share
 /// falls with radius / step below this ratio.
 const RADIUS_PER_STEP: f64 = 1.5;
@@ -139,9 +144,23 @@ pub(crate) fn axis(stack: &Stack, s: &Segmentation) -> Axis {
             }
         }
     }
+    if step[2] > APART_PX * step[0].max(step[1])
+        && across_slices(s) as f64 * step[2] > 2.0 * WITHIN_DIAMETERS * s.radius_mm
+    {
+        return Axis::Slice;
+    }
     let share = CLEARLY_BETTER * (s.radius_mm / (RADIUS_PER_STEP * step[2])).min(1.0);
     let (other, axis) = if mean[1] <= mean[0] { (mean[1], Axis::Row) } else { (mean[0], Axis::Column) };
     if other < share * mean[2] { axis } else { Axis::Slice }
+}
+
+/// From the first to the last slice that the lumen reaches.
+fn across_slices(s: &Segmentation) -> usize {
+    let area = s.size[0] * s.size[1];
+    let reached = |slice: &[Site]| slice.iter().any(|&site| site >= Site::Lumen);
+    let first = s.site.chunks(area).position(reached);
+    let last = s.site.chunks(area).rposition(reached);
+    first.zip(last).map_or(0, |(first, last)| last - first)
 }
 
 /// Smallest lumen, in lattice cells: three quarters of the area of a disc of 1.2 px radius.
