@@ -56,6 +56,24 @@ def test_surface_has_the_arrays_and_the_figures_of_result_json():
     assert math.isclose(mass.GetVolume(), expected["volume_mm3"], rel_tol=1e-3)
 
 
+def test_patches_are_numbered_by_the_ends_of_their_branches():
+    """The portal colours the wall by it: a patch N - 1 lies around the branch that ends at cap N."""
+    surface, expected = read("surface.vtp"), result()
+    points, cells = vtk_to_numpy(surface.GetPoints().GetData()), arrays(surface.GetCellData())
+    if expected["surface"]["patches"] is None:
+        return
+    corners = vtk_to_numpy(surface.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+    lines = {b["id"]: np.array(b["samples"]["position"], float) for b in expected["branches"]}
+    wall = cells["FaceId"] == 0
+    ends = [node for node in expected["graph"]["nodes"] if node["cap"] is not None]
+    assert ends
+    for node in ends:
+        mine = next(e["branch"] for e in expected["graph"]["edges"] if node["id"] in e["nodes"])
+        centres = points[corners[wall & (cells["PatchId"] == node["cap"] - 1)]].mean(axis=1)[::50]
+        near = {b: np.linalg.norm(centres[:, None] - line[None], axis=2).min(axis=1).mean() for b, line in lines.items()}
+        assert min(near, key=near.get) == mine, (node, near)
+
+
 def test_a_surface_said_to_be_watertight_is_watertight():
     if not result()["surface"]["watertight"]:
         return

@@ -100,9 +100,16 @@ export function sizeOf(found, junction) {
   return graft?.diameter_mm ?? 5;
 }
 
+// A patch is numbered by the end that its branch runs to (PatchId is FaceId of that end's cap less one), not by its branch.
+function branchOf(found, id) {
+  const end = found.graph.nodes.find((node) => node.cap === id + 1);
+  const edge = found.graph.edges.find((e) => end && e.nodes.includes(end.id));
+  return found.branches.find((b) => b.id === edge?.branch);
+}
+
 // A patch has the colour of its branch's role; where several branches have one role (a tree) each patch has one of its own.
 function shadeOf(found, id) {
-  const branch = found.branches.find((b) => b.id === id);
+  const branch = branchOf(found, id);
   const alone = branch && found.branches.every((b) => b.twins < 2) && branch.role !== "other";
   return alone ? { name: branch.role.replace("_", "-"), kind: roleKind(branch) } : { name: `angle-${id % 6}`, kind: `a${id % 6}` };
 }
@@ -113,7 +120,7 @@ function legendOf(legend, mode, told, found) {
   const bar = (kind, label) => h("span", { class: `bar ${kind}`, role: "img", "aria-label": label });
   const parts = {
     displacement: () => { const most = number(told.most, 2); return [t("scene.inward"), value(`≥ ${most} mm`), bar("", t("scene.ramp", { most })), value(`≥ ${most} mm`), t("scene.outward")]; },
-    patches: () => told.patches.map((id) => h("span", {}, h("span", { class: `dot ${shadeOf(found, id).kind}`, "aria-hidden": "true" }), roleName(found.branches.find((b) => b.id === id) ?? { role: "other", id }))),
+    patches: () => told.patches.map((id) => h("span", {}, h("span", { class: `dot ${shadeOf(found, id).kind}`, "aria-hidden": "true" }), roleName(branchOf(found, id) ?? { role: "other", id }))),
     quality: () => [t("scene.shapes"), value(`${SHAPES[0]}°`), bar("back", t("scene.shapes_ramp")), value(`${SHAPES[1]}°`)],
   }[mode];
   legend.replaceChildren(...(told === null ? [t("scene.no_patches")] : (parts?.() ?? [])));
