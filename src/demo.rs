@@ -49,11 +49,14 @@ async fn whole(a: &Demo) -> Result<()> {
     say!("{}", table::angles(&result, Some(&truth)));
     say!("artefacts in {}\n", a.out.join("artefacts").display());
     say!("portal: {}/#/jobs/{id}\n", server.address);
+    // Whoever came by `cargo xtask demo` has the command nowhere on the path yet.
+    let own = std::env::current_exe()?;
+    say!("your own scan: {} run FOLDER --out RESULT\n", own.display());
     if a.keep || std::io::stdin().is_terminal() {
         say!("the service keeps running; press Ctrl-C to stop it\n");
         tokio::signal::ctrl_c().await?;
     } else {
-        say!("(the service stops now; run `vasculum demo --keep` to look at the portal)\n");
+        say!("(the service stops now; --keep leaves it running, to look at the portal)\n");
     }
     Ok(())
 }
