@@ -108,20 +108,25 @@ pub(crate) fn planes(stack: &Stack, axis: Axis) -> Vec<Plane> {
 /// Another axis is taken only when the mean squared normal component along it is below this share of the slices' one:
 /// slices carry square, unresampled pixels. A vessel turned by 45 degrees keeps its slices.
 const CLEARLY_BETTER: f64 = 0.6;
-/// Where slices lie farther apart than this many pixels ...
-const APART_PX: f64 = 1.75;
-/// ... another axis is taken only by what lies within the slices, and spans no more than this many of its diameters across them: up to
-/// 85 degrees its sections across the columns err by half as much again, or twice as much, as those of the slices (docs/adr/0030).
-const WITHIN_DIAMETERS: f64 = 2.5;
 /// ... and less where the slices are so far apart that a plane across them shows a lumen by few samples: the share
 /// falls with radius / step below this ratio.
 const RADIUS_PER_STEP: f64 = 1.5;
+/// Where slices lie farther apart than this many pixels ...
+const APART_PX: f64 = 1.75;
+/// ... another axis is taken only by what lies within the slices, and spans no more than this many of its diameters across them: at 60
+/// to 80 degrees its sections across the columns err by a third more, or twice as much, as those of the slices (docs/adr/0030).
+const WITHIN_DIAMETERS: f64 = 2.5;
 
 /// The axis that the lumen follows: the one along which its wall's normals have the smallest mean square, slices unless
 /// another is clearly better.
 pub(crate) fn axis(stack: &Stack, s: &Segmentation) -> Axis {
     let n = s.size;
     let step = [stack.pixel_spacing_mm[1], stack.pixel_spacing_mm[0], stack.slice_spacing_mm()];
+    if step[2] > APART_PX * step[0].max(step[1])
+        && across_slices(s) as f64 * step[2] > 2.0 * WITHIN_DIAMETERS * s.radius_mm
+    {
+        return Axis::Slice;
+    }
     let inside = |p: [i64; 3]| {
         let q: [usize; 3] = std::array::from_fn(|a| p[a].clamp(0, n[a] as i64 - 1) as usize);
         s.site[q[0] + n[0] * (q[1] + n[1] * q[2])] >= Site::Lumen
@@ -143,11 +148,6 @@ pub(crate) fn axis(stack: &Stack, s: &Segmentation) -> Axis {
                 mean[a] += g[a] * g[a] / length;
             }
         }
-    }
-    if step[2] > APART_PX * step[0].max(step[1])
-        && across_slices(s) as f64 * step[2] > 2.0 * WITHIN_DIAMETERS * s.radius_mm
-    {
-        return Axis::Slice;
     }
     let share = CLEARLY_BETTER * (s.radius_mm / (RADIUS_PER_STEP * step[2])).min(1.0);
     let (other, axis) = if mean[1] <= mean[0] { (mean[1], Axis::Row) } else { (mean[0], Axis::Column) };

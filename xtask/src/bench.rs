@@ -79,12 +79,8 @@ pub(crate) fn portal(visits: usize) -> Result<()> {
     ensure!(visits > 0, "at least one visit");
     let binary = tools::release_binary()?;
     tools::browser()?;
-    let packages = tools::node_packages()?;
-    // modules resolve packages from their own folder: run a copy beside node_modules
-    let copy = packages.join("bench-portal.mjs");
-    fs::copy(shell::root()?.join("tests/bench/portal.mjs"), &copy)?;
-    let mut bench = shell::command("node");
-    bench.arg(copy).arg(binary).arg(tools::target()?.join("bench-portal")).arg(visits.to_string());
+    let mut bench = tools::node_script(&tools::node_packages()?, &shell::root()?.join("tests/bench/portal.mjs"))?;
+    bench.arg(binary).arg(tools::target()?.join("bench-portal")).arg(visits.to_string());
     shell::run(bench)
 }
 

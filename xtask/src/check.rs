@@ -193,11 +193,8 @@ fn judges(judged: &Judged) -> Result<Vec<Check<'_>>> {
 fn browsers(judged: &Judged) -> Result<Vec<Check<'_>>> {
     let mut checks: Vec<Check<'_>> = Vec::new();
     for script in scripts("tests/js", "mjs")? {
-        // modules resolve packages from their own folder: run a copy beside node_modules
-        let copy = judged.node.join(script.file_name().unwrap_or_default());
-        fs::copy(&script, &copy)?;
-        let mut judge = shell::command("node");
-        judge.arg(&copy).env("VASCULUM_WORK", &judged.work);
+        let mut judge = tools::node_script(&judged.node, &script)?;
+        judge.env("VASCULUM_WORK", &judged.work);
         checks.push(Box::new(|| judge_one(judge, judged)));
     }
     Ok(checks)

@@ -326,6 +326,16 @@ pub(crate) fn node_packages() -> Result<PathBuf> {
     Ok(dir)
 }
 
+/// A script run by Node.js with the packages of that folder: modules resolve them from their own folder, so that a copy of the
+/// script beside `node_modules` is run.
+pub(crate) fn node_script(packages: &Path, script: &Path) -> Result<std::process::Command> {
+    let copy = packages.join(script.file_name().unwrap_or_default());
+    fs::copy(script, &copy)?;
+    let mut command = shell::command("node");
+    command.arg(copy);
+    Ok(command)
+}
+
 /// Install Debian packages, as root or through sudo.
 fn apt(what: &str, packages: &[&str]) -> Result<()> {
     eprintln!("xtask: installing {what}: {}", packages.join(" "));
